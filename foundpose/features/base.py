@@ -1,0 +1,57 @@
+"""What every patch extractor provides."""
+
+from abc import ABC, abstractmethod
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+Fingerprint = dict[str, str | int | float | bool | None]
+
+
+class PatchFeatures(NamedTuple):
+    """Descriptors of the patches of a batch of images.
+
+    Attributes:
+        patches: (B, C, h, w) raw descriptors; cell (row, column) is centred at pixel
+            ``(stride * column + offset, stride * row + offset)``.
+        cls: (B, C) global descriptor, or None where the extractor has none.
+    """
+
+    patches: Tensor
+    cls: Tensor | None
+
+
+class PatchExtractor(nn.Module, ABC):
+    """Maps square images to a regular grid of patch descriptors.
+
+    Args:
+        channels: length C of a descriptor.
+        stride: distance of neighbouring patch centres in pixels.
+        offset: pixel coordinate of the first patch centre (integer coordinates are pixel centres).
+    """
+
+    def __init__(self, channels: int, stride: float, offset: float) -> None:
+        super().__init__()
+        self.channels = channels
+        self.stride = stride
+        self.offset = offset
+
+    @abstractmethod
+    def forward(self, images: Tensor) -> PatchFeatures:
+        """Describe the patches of RGB images (B, 3, S, S) with values in [0, 1]."""
+
+    @abstractmethod
+    def fingerprint(self) -> Fingerprint:
+        """Settings that change the descriptors; an object representation is valid for one fingerprint only."""
+
+    def grid_size(self, image_size: int) -> int:
+        """Number of patches along one side of an image of ``image_size`` pixels."""
+        return int((image_size - 1 - 2 * self.offset) / self.stride + 1e-6) + 1
+
+    def patch_centers(self, image_size: int, device: torch.device, dtype: torch.dtype) -> Tensor:
+        """Pixel coordinates (h, w, 2) of the patch centres as ``(u, v)``."""
+        n = self.grid_size(image_size)
+        axis = torch.arange(n, device=device, dtype=dtype) * self.stride + self.offset
+        v, u = torch.meshgrid(axis, axis, indexing="ij")
+        return torch.stack([u, v], dim=-1)

@@ -1,0 +1,50 @@
+"""Cameras, crops, rotations and rigid transformations."""
+
+from foundpose.geometry.boxes import boxes_from_masks, boxes_from_points, boxes_from_xywh, masks_from_boxes
+from foundpose.geometry.cameras import (
+    axis_rotation_to_ray,
+    camera_on_boxes,
+    intrinsics_matrix,
+    pixel_grid,
+    pixel_rays,
+    project_points,
+    resize_intrinsics,
+    shift_intrinsics,
+    unproject_pixels,
+)
+from foundpose.geometry.crop import Crops, PerspectiveCrop
+from foundpose.geometry.transforms import (
+    invert_transform,
+    make_transform,
+    project_to_rotation,
+    rotation_angle,
+    se3_exp,
+    transform_points,
+)
+from foundpose.geometry.viewpoints import sphere_inplane_rotations, super_fibonacci_rotations
+
+__all__ = [
+    "Crops",
+    "PerspectiveCrop",
+    "axis_rotation_to_ray",
+    "boxes_from_masks",
+    "boxes_from_points",
+    "boxes_from_xywh",
+    "camera_on_boxes",
+    "intrinsics_matrix",
+    "invert_transform",
+    "make_transform",
+    "masks_from_boxes",
+    "pixel_grid",
+    "pixel_rays",
+    "project_points",
+    "project_to_rotation",
+    "resize_intrinsics",
+    "rotation_angle",
+    "se3_exp",
+    "shift_intrinsics",
+    "sphere_inplane_rotations",
+    "super_fibonacci_rotations",
+    "transform_points",
+    "unproject_pixels",
+]

@@ -1,0 +1,192 @@
+"""Perspective crops: virtual pinhole cameras focused on image regions."""
+
+import math
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from kornia.geometry.transform import warp_perspective
+from torch import Tensor, nn
+
+from foundpose.geometry.boxes import boxes_from_masks, masks_from_boxes
+from foundpose.geometry.cameras import camera_on_boxes
+
+
+class Crops(NamedTuple):
+    """A batch of perspective crops.
+
+    Attributes:
+        images: (B, 3, S, S), black where the crop camera looks beyond the image.
+        masks: (B, S, S) in [0, 1], warped bilinearly; inside where above 0.5.
+        K_crop: (B, 3, 3) intrinsics of the virtual cameras, pixels.
+        T_crop_from_camera: (B, 4, 4) rotations of the virtual cameras.
+        boxes: (B, 4) boxes in the image that the crops are focused on, pixel edges.
+        valid: (B,) False for a mask that is empty or smaller than ``min_box_size``, and for a box that is
+            degenerate or outside its image. Such a crop shows the whole image, its mask is zero.
+    """
+
+    images: Tensor
+    masks: Tensor
+    K_crop: Tensor
+    T_crop_from_camera: Tensor
+    boxes: Tensor
+    valid: Tensor
+
+
+class PerspectiveCrop(nn.Module):
+    """Warps image regions to virtual pinhole cameras (paper, "Perspective cropping").
+
+    The axis of a virtual camera passes through the centre of the mask's 2D box and the longer side of the warped
+    box is ``fill * size`` pixels. Several crops of one image share its memory.
+
+    Args:
+        size: side S of a crop in pixels.
+        fill: δ, share of the crop's side that the box takes, in (0, 1].
+        antialias: filter the image where a crop shrinks it (trilinear sampling of a box-filtered pyramid).
+        min_box_size: boxes whose longer side is less than this many pixels are flagged as not valid.
+    """
+
+    def __init__(
+        self, size: int = 420, fill: float = 0.6, antialias: bool = True, min_box_size: float = 2.0
+    ) -> None:
+        super().__init__()
+        if size < 2:
+            raise ValueError(f"size must be at least 2 pixels, got {size}")
+        if not 0.0 < fill <= 1.0:
+            raise ValueError(f"fill must be in (0, 1], got {fill}")
+        self.size = size
+        self.fill = fill
+        self.antialias = antialias
+        self.min_box_size = min_box_size
+
+    def forward(
+        self,
+        images: Tensor,
+        K: Tensor,
+        masks: Tensor | None = None,
+        boxes: Tensor | None = None,
+        image_index: Tensor | None = None,
+    ) -> Crops:
+        """Crop.
+
+        Args:
+            images: (N, 3, H, W) in [0, 1].
+            K: (N, 3, 3) intrinsics in pixels.
+            masks: (B, H, W), non-zero inside. Either masks or boxes must be given; with both, the boxes say where
+                the crops look and the masks are warped along.
+            boxes: (B, 4) as ``(left, top, right, bottom)`` pixel edges.
+            image_index: (B,) which image each mask belongs to; may be left out where B == N.
+
+        Raises:
+            ValueError: shapes or values that do not fit.
+
+        Differentiable w.r.t. ``images``, ``K`` and ``boxes`` (the pyramid level is held fixed).
+        """
+        image_index = _check_inputs(images, K, masks, boxes, image_index)
+        height, width = images.shape[-2:]
+        if masks is not None:
+            mask_boxes, occupied = boxes_from_masks(masks)
+            boxes = mask_boxes.to(images.dtype) if boxes is None else boxes
+        else:
+            assert boxes is not None
+            occupied = torch.ones(len(boxes), dtype=torch.bool, device=boxes.device)
+        boxes, valid = _usable_boxes(boxes, height, width, self.min_box_size)
+        valid = valid & occupied
+
+        K_camera = K[image_index]
+        K_crop, T_crop_from_camera = camera_on_boxes(boxes, K_camera, self.size, self.fill)
+        homographies = K_crop @ T_crop_from_camera[:, :3, :3] @ torch.linalg.inv(K_camera)
+        levels = torch.zeros(len(boxes), device=images.device, dtype=images.dtype)
+        if self.antialias:
+            shrink = (K_camera[:, [0, 1], [0, 1]].abs().amax(1) / K_crop[:, 0, 0]).detach()
+            levels = shrink.clamp(min=1.0).log2()
+        crops = warp_images(images, homographies, image_index, levels, self.size)
+        region = masks_from_boxes(boxes.detach(), height, width) if masks is None else masks != 0
+        region = (region & valid[:, None, None]).to(images.dtype)
+        crop_masks = warp_perspective(
+            region[:, None], homographies.detach(), (self.size, self.size), align_corners=True
+        )
+        return Crops(crops, crop_masks[:, 0], K_crop, T_crop_from_camera, boxes, valid)
+
+
+def warp_images(
+    images: Tensor, homographies: Tensor, image_index: Tensor, levels: Tensor, size: int
+) -> Tensor:
+    """Warp images to square crops, sampling level ``levels`` of their pyramids.
+
+    Args:
+        images: (N, C, H, W).
+        homographies: (B, 3, 3) from pixels of the image to pixels of the crop.
+        image_index: (B,) which image to warp.
+        levels: (B,) pyramid level, 0 is the image itself; in between, two levels are blended.
+        size: side of the crops.
+
+    Returns:
+        (B, C, size, size). Differentiable w.r.t. ``images`` and ``homographies``.
+    """
+    height, width = images.shape[-2:]
+    top_level = int(math.log2(min(height, width))) - 1
+    levels = levels.clamp(max=max(top_level, 0))
+    # The one transfer to the host: which crop needs which image and level.
+    plan = torch.stack([image_index.to(levels.dtype), levels.floor(), levels.ceil()]).tolist()
+    members: dict[tuple[int, int], list[int]] = {}
+    for crop, (image, low, high) in enumerate(zip(*plan, strict=True)):
+        for level in {int(low), int(high)}:
+            members.setdefault((int(image), level), []).append(crop)
+    pyramid = [images]
+    for _ in range(max((level for _, level in members), default=0)):
+        pyramid.append(F.avg_pool2d(pyramid[-1], 2, ceil_mode=True, count_include_pad=False))
+    out = images.new_zeros(len(homographies), images.shape[1], size, size)
+    for (image, level), crop_list in members.items():
+        crops = torch.tensor(crop_list, device=images.device)
+        factor = 2.0**level
+        # Pixel u of a level is centred at factor * (u + 0.5) - 0.5 in the image.
+        to_image = homographies.new_tensor(
+            [[factor, 0.0, factor / 2 - 0.5], [0.0, factor, factor / 2 - 0.5], [0.0, 0.0, 1.0]]
+        )
+        source = pyramid[level][image].expand(len(crop_list), -1, -1, -1)
+        warped = warp_perspective(source, homographies[crops] @ to_image, (size, size), align_corners=True)
+        weight = 1.0 - (levels[crops] - level).abs()
+        out = out.index_add(0, crops, warped * weight[:, None, None, None])
+    return out
+
+
+def _usable_boxes(boxes: Tensor, height: int, width: int, min_size: float) -> tuple[Tensor, Tensor]:
+    """Replace boxes that cannot be cropped by the whole image; say which ones were usable."""
+    left, top, right, bottom = boxes.unbind(-1)
+    valid = torch.isfinite(boxes).all(dim=-1) & (right > left) & (bottom > top)
+    valid &= torch.maximum(right - left, bottom - top) >= min_size
+    valid &= (right > -0.5) & (left < width - 0.5) & (bottom > -0.5) & (top < height - 0.5)
+    whole = boxes.new_tensor([-0.5, -0.5, width - 0.5, height - 0.5])
+    return torch.where(valid[:, None], boxes, whole), valid
+
+
+def _check_inputs(
+    images: Tensor, K: Tensor, masks: Tensor | None, boxes: Tensor | None, image_index: Tensor | None
+) -> Tensor:
+    """Check shapes and values; return the image index."""
+    if images.dim() != 4 or images.shape[1] != 3 or not images.is_floating_point():
+        raise ValueError(
+            f"images must be floating point (N, 3, H, W), got {images.dtype} {tuple(images.shape)}"
+        )
+    num_images, _, height, width = images.shape
+    if K.shape != (num_images, 3, 3):
+        raise ValueError(f"K must have shape ({num_images}, 3, 3), one for each image, got {tuple(K.shape)}")
+    if masks is None and boxes is None:
+        raise ValueError("give masks (B, H, W) or boxes (B, 4); got neither")
+    if masks is not None and (masks.dim() != 3 or masks.shape[1:] != (height, width)):
+        raise ValueError(
+            f"masks must have shape (B, {height}, {width}) as the images, got {tuple(masks.shape)}"
+        )
+    if boxes is not None and (boxes.dim() != 2 or boxes.shape[1] != 4):
+        raise ValueError(f"boxes must have shape (B, 4), got {tuple(boxes.shape)}")
+    count = len(masks) if masks is not None else len(boxes) if boxes is not None else 0
+    if masks is not None and boxes is not None and len(boxes) != len(masks):
+        raise ValueError(f"masks and boxes must agree in number, got {len(masks)} and {len(boxes)}")
+    if image_index is None:
+        if count != num_images:
+            raise ValueError(f"image_index is needed: {count} masks or boxes for {num_images} images")
+        return torch.arange(count, device=images.device)
+    if image_index.shape != (count,) or image_index.is_floating_point():
+        raise ValueError(f"image_index must be ({count},) integers, got {tuple(image_index.shape)}")
+    return image_index.to(images.device)

@@ -1,0 +1,80 @@
+"""Rigid transformations as (..., 4, 4) matrices.
+
+``T_b_from_a`` maps points of frame ``a`` to frame ``b``. Twists are ``(v, ω)`` and act from the left:
+``T ← se3_exp(δ) @ T``.
+"""
+
+import torch
+from kornia.geometry.liegroup import Se3
+from torch import Tensor
+
+
+def make_transform(R: Tensor, t: Tensor) -> Tensor:
+    """Stack rotations and translations into homogeneous matrices.
+
+    Args:
+        R: (..., 3, 3) rotations.
+        t: (..., 3) translations, any length unit.
+
+    Returns:
+        (..., 4, 4) transformations.
+
+    Differentiable w.r.t. both arguments.
+    """
+    if R.shape[-2:] != (3, 3) or t.shape[-1] != 3:
+        raise ValueError(f"R and t must end in (3, 3) and (3,), got {tuple(R.shape)} and {tuple(t.shape)}")
+    top = torch.cat([R, t.unsqueeze(-1).expand(*R.shape[:-1], 1)], dim=-1)
+    bottom = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 4)
+    return torch.cat([top, bottom], dim=-2)
+
+
+def invert_transform(T: Tensor) -> Tensor:
+    """Invert rigid transformations: (..., 4, 4) → (..., 4, 4). Differentiable w.r.t. ``T``."""
+    R_inv = T[..., :3, :3].transpose(-1, -2)
+    return make_transform(R_inv, -(R_inv @ T[..., :3, 3:]).squeeze(-1))
+
+
+def transform_points(T_b_from_a: Tensor, points_a: Tensor) -> Tensor:
+    """Map points from frame a to frame b.
+
+    Args:
+        T_b_from_a: (..., 4, 4).
+        points_a: (..., N, 3), leading dimensions broadcast with those of ``T_b_from_a``.
+
+    Returns:
+        (..., N, 3) points in frame b. Differentiable w.r.t. both arguments.
+    """
+    return points_a @ T_b_from_a[..., :3, :3].transpose(-1, -2) + T_b_from_a[..., None, :3, 3]
+
+
+def se3_exp(twist: Tensor) -> Tensor:
+    """Exponential map of SE(3): twists (..., 6) as ``(v, ω)`` → (..., 4, 4).
+
+    Differentiable w.r.t. ``twist`` everywhere, the identity included (kornia's ``Se3``).
+    """
+    if twist.shape[-1] != 6:
+        raise ValueError(f"twist must have shape (..., 6), got {tuple(twist.shape)}")
+    return Se3.exp(twist.reshape(-1, 6)).matrix().reshape(*twist.shape[:-1], 4, 4)
+
+
+def rotation_angle(R_a: Tensor, R_b: Tensor) -> Tensor:
+    """Geodesic distance between rotations: two (..., 3, 3) → (...) in radians, accurate near 0 and π.
+
+    Differentiable w.r.t. both arguments where they differ (the distance has a kink at zero).
+    """
+    R = R_a.transpose(-1, -2) @ R_b
+    axis = torch.stack(
+        [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], dim=-1
+    )
+    return torch.atan2(torch.linalg.vector_norm(axis, dim=-1), R.diagonal(dim1=-2, dim2=-1).sum(-1) - 1.0)
+
+
+def project_to_rotation(M: Tensor) -> Tensor:
+    """Nearest rotation in the Frobenius norm: (..., 3, 3) → (..., 3, 3), determinant +1.
+
+    Differentiable w.r.t. ``M`` where its singular values differ.
+    """
+    U, _, Vh = torch.linalg.svd(M)
+    sign = torch.det(U @ Vh).sign()
+    flip = torch.stack([torch.ones_like(sign), torch.ones_like(sign), sign], dim=-1)
+    return (U * flip.unsqueeze(-2)) @ Vh
