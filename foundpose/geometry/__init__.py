@@ -21,11 +21,18 @@ from foundpose.geometry.transforms import (
     se3_exp,
     transform_points,
 )
-from foundpose.geometry.viewpoints import sphere_inplane_rotations, super_fibonacci_rotations
+from foundpose.geometry.viewpoints import (
+    SphereInplane,
+    SuperFibonacci,
+    sphere_inplane_rotations,
+    super_fibonacci_rotations,
+)
 
 __all__ = [
     "Crops",
     "PerspectiveCrop",
+    "SphereInplane",
+    "SuperFibonacci",
     "axis_rotation_to_ray",
     "boxes_from_masks",
     "boxes_from_points",

@@ -54,7 +54,9 @@ def se3_exp(twist: Tensor) -> Tensor:
     """
     if twist.shape[-1] != 6:
         raise ValueError(f"twist must have shape (..., 6), got {tuple(twist.shape)}")
-    return Se3.exp(twist.reshape(-1, 6)).matrix().reshape(*twist.shape[:-1], 4, 4)
+    T = Se3.exp(twist.reshape(-1, 6)).matrix().reshape(*twist.shape[:-1], 4, 4)
+    # kornia wraps a plain translation as a Parameter; constants must stay constants.
+    return T if twist.requires_grad else T.detach()
 
 
 def rotation_angle(R_a: Tensor, R_b: Tensor) -> Tensor:

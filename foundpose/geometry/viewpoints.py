@@ -4,7 +4,7 @@ import math
 
 import torch
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
-from torch import Tensor
+from torch import Tensor, nn
 
 # The spiral's two irrational steps: sqrt(2) and the positive root of psi^4 = psi + 4 (Alexa 2022).
 _PHI = math.sqrt(2.0)
@@ -67,3 +67,45 @@ def sphere_inplane_rotations(num_views: int = 57, num_inplane: int = 14) -> Tens
         [angle.cos(), -angle.sin(), zero, angle.sin(), angle.cos(), zero, zero, zero, one], dim=-1
     ).reshape(-1, 3, 3)
     return (R_inplane[None] @ R_views[:, None]).reshape(-1, 3, 3)
+
+
+class SuperFibonacci(nn.Module):
+    """Orientations on super-Fibonacci spirals; see :func:`super_fibonacci_rotations`.
+
+    Args:
+        count: number of orientations.
+    """
+
+    def __init__(self, count: int = 800) -> None:
+        super().__init__()
+        self.count = count
+
+    def forward(self) -> Tensor:
+        """Rotations (count, 3, 3), float64."""
+        return super_fibonacci_rotations(self.count)
+
+    def extra_repr(self) -> str:
+        """Settings, for printing."""
+        return f"count={self.count}"
+
+
+class SphereInplane(nn.Module):
+    """View directions times in-plane rotations; see :func:`sphere_inplane_rotations`.
+
+    Args:
+        num_views: number of viewing directions.
+        num_inplane: number of in-plane rotations for each of them.
+    """
+
+    def __init__(self, num_views: int = 57, num_inplane: int = 14) -> None:
+        super().__init__()
+        self.num_views = num_views
+        self.num_inplane = num_inplane
+
+    def forward(self) -> Tensor:
+        """Rotations (num_views * num_inplane, 3, 3), float64."""
+        return sphere_inplane_rotations(self.num_views, self.num_inplane)
+
+    def extra_repr(self) -> str:
+        """Settings, for printing."""
+        return f"num_views={self.num_views}, num_inplane={self.num_inplane}"

@@ -44,6 +44,6 @@ class RetrievedTemplates(NamedTuple):
         valid: (B, h) bool.
     """
 
-    index: Tensor
+    index: Tensor  # type: ignore[assignment]  # hides tuple.index
     similarity: Tensor
     valid: Tensor

@@ -35,6 +35,7 @@ def test_exponential_map_equals_the_matrix_exponential(rng):
 def test_exponential_map_is_differentiable_at_the_identity():
     for twist in (torch.zeros(2, 6), torch.full((2, 6), 0.4)):
         assert torch.autograd.gradcheck(se3_exp, (twist.double().requires_grad_(),))
+        assert not se3_exp(twist).requires_grad
 
 
 def test_inverse_and_composition():

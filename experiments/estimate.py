@@ -1,0 +1,231 @@
+"""Estimate poses in one picture of your own, or in the pictures of a BOP dataset.
+
+python experiments/estimate.py image=photo.jpg mesh=cup.ply mask=mask.png intrinsics=[fx,fy,cx,cy]
+python experiments/estimate.py data=lmo data.root=/path/to/lmo masks=gt extractor=dense_sift
+"""
+
+import json
+import time
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import hydra
+import torch
+from hydra.core.hydra_config import HydraConfig
+from hydra.utils import instantiate
+from kornia.geometry.calibration import undistort_image
+from omegaconf import DictConfig
+from torch import Tensor
+from tqdm import tqdm
+
+from foundpose.bop import BopDataset, Instance, PoseResult, read_image, read_mask, write_results
+from foundpose.config import Method, build_method, claim_run_folder, clear_errors
+from foundpose.geometry import boxes_from_xywh, intrinsics_matrix, masks_from_boxes
+from foundpose.io import write_atomically
+from foundpose.onboarding import ObjectRepresentation
+from foundpose.pipeline import PoseEstimates, PoseStatus
+from foundpose.progress import ProgressBars
+from foundpose.rendering import Mesh, load_mesh, warn_if_scale_implausible
+from foundpose.visualization import save_estimate_figure
+
+# Settings that may change when a run is resumed.
+MAY_CHANGE = ("device", "max_images", "overlays", "representations")
+
+
+@hydra.main(version_base="1.3", config_path="../conf", config_name="estimate")
+def main(cfg: DictConfig) -> None:
+    """Estimate and write JSON, BOP CSV and overlays to the run's folder."""
+    output = Path(HydraConfig.get().runtime.output_dir)
+    with clear_errors():
+        if cfg.image is not None:
+            estimate_picture(cfg, output)
+        else:
+            estimate_dataset(cfg, output)
+
+
+def estimate_picture(cfg: DictConfig, output: Path) -> None:
+    """One picture, one mesh, one mask or box."""
+    for name in ("mesh", "intrinsics"):
+        if cfg[name] is None:
+            raise ValueError(f"with image=… give {name}=… too")
+    if (cfg.mask is None) == (cfg.box is None):
+        raise ValueError("give either mask=… (a picture) or box=[x,y,width,height]")
+    if len(cfg.intrinsics) != 4:
+        raise ValueError(f"intrinsics must be [fx,fy,cx,cy], got {list(cfg.intrinsics)}")
+    image = read_image(Path(cfg.image))
+    height, width = image.shape[1:]
+    K = intrinsics_matrix(*cfg.intrinsics)
+    if cfg.mask is not None:
+        mask = read_mask(Path(cfg.mask), (height, width))
+    else:
+        if len(cfg.box) != 4:
+            raise ValueError(f"box must be [x,y,width,height], got {list(cfg.box)}")
+        mask = masks_from_boxes(
+            boxes_from_xywh(torch.tensor([list(cfg.box)], dtype=torch.float32)), height, width
+        )[0]
+    if cfg.distortion is not None:
+        image, mask = undistort(image, mask, K, list(cfg.distortion))
+
+    mesh = load_mesh(cfg.mesh)
+    method = build_method(cfg)
+    name = Path(cfg.mesh).stem
+    representation = method.store.get(mesh, name, ProgressBars(name)).to(cfg.device)
+    start = time.perf_counter()
+    estimates = run_pipeline(
+        method, cfg.device, image, K, mask[None], [representation], torch.zeros(1).long()
+    )
+    seconds = time.perf_counter() - start
+    facts = describe(estimates, 0) | {"mesh": str(cfg.mesh), "image": str(cfg.image), "time": seconds}
+    write_json(output / "estimate.json", facts)
+    write_results(output / "results.csv", to_results([facts | {"scene_id": 0, "im_id": 0, "obj_id": 0}]))
+    save_estimate_figure(
+        output / "overlay.png", image, K, estimates, 0, representation, mesh, method.onboarder.renderer
+    )
+    if facts["valid"]:
+        warn_if_scale_implausible(mesh, float(estimates.T_camera_from_model[0, :3, 3].norm()))
+    print(json.dumps(facts, indent=1))
+    print(f"written to {output}")
+
+
+def undistort(image: Tensor, mask: Tensor, K: Tensor, distortion: list[float]) -> tuple[Tensor, Tensor]:
+    """Undo lens distortion of a picture (3, H, W) and its mask; the intrinsics stay the same."""
+    if len(distortion) not in (4, 5, 8, 12, 14):
+        raise ValueError(f"distortion must have 4, 5, 8, 12 or 14 coefficients, got {len(distortion)}")
+    stacked = torch.cat([image, mask[None].to(image.dtype)])
+    straight = undistort_image(stacked[None], K[None], torch.tensor([distortion]))[0]
+    return straight[:3], straight[3] > 0.5
+
+
+def estimate_dataset(cfg: DictConfig, output: Path) -> None:
+    """All instances of a BOP dataset, image by image; finished images are kept in ``images/`` and not repeated."""
+    dataset: BopDataset = instantiate(cfg.data)
+    instances: list[Instance] = instantiate(cfg.masks)(dataset)
+    wanted = set(cfg.objects or dataset.object_ids)
+    by_image: dict[tuple[int, int], list[Instance]] = defaultdict(list)
+    for instance in instances:
+        if instance.obj_id in wanted:
+            by_image[instance.scene_id, instance.im_id].append(instance)
+    images = sorted(by_image)[: cfg.max_images]
+    if not images:
+        raise ValueError(f"no instance of the objects {sorted(wanted)} in {dataset.targets_path}")
+    claim_run_folder(output, cfg, MAY_CHANGE)
+
+    method = build_method(cfg)
+    pictures = instantiate(cfg.pictures)
+    objects: dict[int, tuple[Mesh, ObjectRepresentation]] = {}
+    for obj_id in sorted({i.obj_id for key in images for i in by_image[key]}):
+        mesh = load_mesh(dataset.mesh_path(obj_id))
+        name = f"{dataset.root.name}-{obj_id:06d}"
+        objects[obj_id] = (mesh, method.store.get(mesh, name, ProgressBars(name)).to(cfg.device))
+
+    entries: list[dict[str, Any]] = []
+    for position, (scene_id, im_id) in enumerate(tqdm(images, desc="images")):
+        path = output / "images" / f"{scene_id:06d}_{im_id:06d}.json"
+        if not path.is_file():
+            members = by_image[scene_id, im_id]
+            K = dataset.intrinsics(scene_id, im_id).float()
+            image = pictures(dataset, scene_id, im_id)
+            masks = torch.stack([instance.mask(dataset) for instance in members])
+            ids = sorted({instance.obj_id for instance in members})
+            index = torch.tensor([ids.index(instance.obj_id) for instance in members])
+            start = time.perf_counter()
+            estimates = run_pipeline(method, cfg.device, image, K, masks, [objects[i][1] for i in ids], index)
+            seconds = time.perf_counter() - start + max(instance.time for instance in members)
+            if cfg.overlays and position % cfg.overlays == 0:
+                save_overlays(output / "overlays", dataset, members, K, estimates, objects, method)
+            write_json(
+                path,
+                [
+                    {"scene_id": scene_id, "im_id": im_id, "obj_id": instance.obj_id, "time": seconds}
+                    | {"detection_score": instance.score}
+                    | describe(estimates, i)
+                    for i, instance in enumerate(members)
+                ],
+            )
+        entries += json.loads(path.read_text())
+
+    write_json(output / "estimates.json", entries)
+    csv = output / f"{cfg.method.replace('_', '-')}_{dataset.root.name}-{Path(cfg.data.split).name}.csv"
+    write_results(csv, to_results(entries))
+    valid = sum(entry["valid"] for entry in entries)
+    print(f"{len(entries)} instances in {len(images)} images, {valid} with a pose; written to {csv}")
+
+
+def run_pipeline(
+    method: Method,
+    device: str,
+    image: Tensor,
+    K: Tensor,
+    masks: Tensor,
+    objects: list[ObjectRepresentation],
+    object_index: Tensor,
+) -> PoseEstimates:
+    """Poses of several masks of one image."""
+    with torch.no_grad():
+        return method.pipeline(
+            image[None].to(device),
+            K[None].to(device),
+            objects,
+            masks=masks.to(device),
+            image_index=torch.zeros(len(masks), dtype=torch.int64, device=device),
+            object_index=object_index.to(device),
+        )
+
+
+def describe(estimates: PoseEstimates, index: int) -> dict[str, Any]:
+    """What is written of one estimate."""
+    T = estimates.T_camera_from_model[index].double().cpu()
+    return {
+        "valid": bool(estimates.valid[index]),
+        "status": PoseStatus(int(estimates.status[index])).name,
+        "score": float(estimates.score[index]),
+        "num_inliers": int(estimates.num_inliers[index]),
+        "num_patches": int(estimates.query.valid[index].sum()),
+        "R": T[:3, :3].tolist(),
+        "t": T[:3, 3].tolist(),
+        "templates": estimates.templates.index[index].tolist(),
+        "similarities": estimates.templates.similarity[index].nan_to_num(neginf=-1.0).tolist(),
+        "best": int(estimates.best[index]),
+    }
+
+
+def to_results(entries: list[dict[str, Any]]) -> list[PoseResult]:
+    """Lines of the BOP file; estimates that failed are left out."""
+    results = []
+    for entry in entries:
+        if entry["valid"]:
+            T = torch.eye(4, dtype=torch.float64)
+            T[:3, :3] = torch.tensor(entry["R"], dtype=torch.float64)
+            T[:3, 3] = torch.tensor(entry["t"], dtype=torch.float64)
+            ids = (entry["scene_id"], entry["im_id"], entry["obj_id"])
+            results.append(PoseResult(*ids, entry["score"], T, entry["time"]))
+    return results
+
+
+def save_overlays(
+    folder: Path,
+    dataset: BopDataset,
+    members: list[Instance],
+    K: Tensor,
+    estimates: PoseEstimates,
+    objects: dict[int, tuple[Mesh, ObjectRepresentation]],
+    method: Method,
+) -> None:
+    """One figure per instance of an image."""
+    photograph = dataset.image(members[0].scene_id, members[0].im_id)
+    for i, instance in enumerate(members):
+        mesh, representation = objects[instance.obj_id]
+        name = f"{instance.scene_id:06d}_{instance.im_id:06d}_{instance.obj_id:06d}_{i}.png"
+        save_estimate_figure(
+            folder / name, photograph, K, estimates, i, representation, mesh, method.onboarder.renderer
+        )
+
+
+def write_json(path: Path, content: Any) -> None:  # noqa: ANN401 - JSON
+    """Write JSON atomically."""
+    write_atomically(path, lambda temporary: temporary.write_text(json.dumps(content, indent=1)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,53 @@
+"""Onboard one mesh or all objects of a BOP dataset; what is there already is skipped.
+
+python experiments/onboard.py mesh=cup.ply
+python experiments/onboard.py data=lmo data.root=/path/to/lmo objects=[1,5]
+"""
+
+from pathlib import Path
+
+import hydra
+from hydra.utils import instantiate
+from omegaconf import DictConfig
+
+from foundpose.bop import BopDataset
+from foundpose.config import Method, build_method, clear_errors
+from foundpose.progress import ProgressBars
+from foundpose.rendering import load_mesh
+
+
+def meshes_to_onboard(cfg: DictConfig) -> dict[str, Path]:
+    """Names and files of the meshes that the config asks for."""
+    if cfg.mesh is not None:
+        return {Path(cfg.mesh).stem: Path(cfg.mesh)}
+    dataset: BopDataset = instantiate(cfg.data)
+    return {
+        f"{dataset.root.name}-{obj_id:06d}": dataset.mesh_path(obj_id)
+        for obj_id in cfg.objects or dataset.object_ids
+    }
+
+
+@hydra.main(version_base="1.3", config_path="../conf", config_name="onboard")
+def main(cfg: DictConfig) -> None:
+    """Onboard and print one line per object."""
+    with clear_errors():
+        files = meshes_to_onboard(cfg)
+        method = build_method(cfg)
+        for name, file in files.items():
+            onboard(method, name, file)
+
+
+def onboard(method: Method, name: str, file: Path) -> None:
+    """Onboard one mesh unless that has been done."""
+    mesh = load_mesh(file)
+    known = method.store.has(mesh, name)
+    representation = method.store.get(mesh, name, ProgressBars(name))
+    size = representation.memory_bytes()["total"] / 2**20
+    print(
+        f"{name}: {'already there' if known else 'onboarded'}, {representation.num_templates} templates, "
+        f"{len(representation.descriptors)} patches, {size:.0f} MiB, {method.store.path(mesh, name)}"
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,96 @@
+"""From Hydra configs to modules, and what the apps share."""
+
+import difflib
+import json
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+
+from foundpose.features import PatchExtractor
+from foundpose.io import write_atomically
+from foundpose.onboarding import Onboarder, RepresentationStore
+from foundpose.pipeline import FoundPose
+
+
+class Method(NamedTuple):
+    """What ``conf/config.yaml`` describes.
+
+    Attributes:
+        onboarder: builds object representations.
+        pipeline: estimates poses.
+        store: keeps representations on disk.
+    """
+
+    onboarder: Onboarder
+    pipeline: FoundPose
+    store: RepresentationStore
+
+
+def build_method(cfg: DictConfig) -> Method:
+    """Instantiate onboarder and pipeline on ``cfg.device``; they share the extractor.
+
+    Raises:
+        ValueError: the device does not exist.
+    """
+    device = torch.device(cfg.device)
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise ValueError("device is 'cuda' but this PyTorch sees no GPU; use device=cpu")
+    extractor: PatchExtractor = instantiate(cfg.extractor).to(device).eval()
+    query_extractor = extractor if cfg.corruption is None else instantiate(cfg.corruption)(extractor)
+    onboarder: Onboarder = instantiate(cfg.onboarder, extractor=extractor)
+    pipeline: FoundPose = instantiate(cfg.pipeline, extractor=query_extractor)
+    return Method(
+        onboarder.to(device).eval(),
+        pipeline.to(device).eval(),
+        RepresentationStore(cfg.representations, onboarder),
+    )
+
+
+def claim_run_folder(folder: Path, cfg: DictConfig, ignore: tuple[str, ...]) -> None:
+    """Record the settings of a run in its folder, or make sure that a run being resumed has the same ones.
+
+    Args:
+        folder: the run's folder.
+        cfg: the settings.
+        ignore: top-level keys that may change between the parts of a run.
+
+    Raises:
+        ValueError: the folder belongs to a run with other settings; the message shows the difference.
+    """
+    settings = OmegaConf.to_container(cfg, resolve=True)
+    assert isinstance(settings, dict)
+    text = json.dumps({k: v for k, v in settings.items() if k not in ignore}, indent=1, sort_keys=True)
+    path = folder / "settings.json"
+    if path.is_file():
+        before = path.read_text()
+        if before != text:
+            changes = [
+                line
+                for line in difflib.ndiff(before.splitlines(), text.splitlines())
+                if line.startswith(("-", "+"))
+            ]
+            raise ValueError(
+                f"{folder} holds a run with other settings; give another hydra.run.dir or the old settings. "
+                "Difference:\n" + "\n".join(changes)
+            )
+        return
+    write_atomically(path, lambda temporary: temporary.write_text(text))
+
+
+@contextmanager
+def clear_errors() -> Iterator[None]:
+    """Turn bad input into one line on standard error and exit status 2; HYDRA_FULL_ERROR=1 shows where it arose."""
+    try:
+        yield
+    except (ValueError, FileNotFoundError) as error:
+        if os.environ.get("HYDRA_FULL_ERROR") == "1":
+            raise
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)

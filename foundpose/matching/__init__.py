@@ -1,0 +1,1 @@
+"""Crop-to-template patch matching."""

@@ -1,0 +1,257 @@
+"""What is kept of an object after onboarding."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import NamedTuple, Self
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from foundpose.features.base import Fingerprint, PatchExtractor
+from foundpose.features.pca import PcaProjection
+from foundpose.io import write_atomically
+
+SCHEMA_VERSION = 1
+
+
+@dataclass(frozen=True)
+class RepresentationInfo:
+    """Facts about a representation that are not tensors.
+
+    Attributes:
+        name: the object's name.
+        diameter: largest distance between two mesh vertices, mesh units.
+        mesh_checksum: checksum of the mesh that was onboarded.
+        extractor: fingerprint of the extractor that made the descriptors.
+        image_size: side of a template in pixels.
+        stride: distance of patch centres in pixels.
+        offset: coordinate of the first patch centre in pixels.
+        grid: number of patches along a side.
+        settings: further settings of the onboarding, for the record.
+        schema_version: version of the file format.
+    """
+
+    name: str
+    diameter: float
+    mesh_checksum: str
+    extractor: Fingerprint
+    image_size: int
+    stride: float
+    offset: float
+    grid: int
+    settings: dict[str, str | int | float | bool | None] = field(default_factory=dict)
+    schema_version: int = SCHEMA_VERSION
+
+
+class TemplatePatches(NamedTuple):
+    """Patches of some templates, padded to the largest template of the object.
+
+    Attributes:
+        descriptors: (..., Q, d) projected descriptors, zero where not valid.
+        points_model: (..., Q, 3) mesh units, zero where not valid.
+        pixels: (..., Q, 2) patch centres in the template.
+        valid: (..., Q) bool.
+    """
+
+    descriptors: Tensor
+    points_model: Tensor
+    pixels: Tensor
+    valid: Tensor
+
+
+class ObjectRepresentation(nn.Module):
+    """Everything that inference needs to know of one object, as buffers.
+
+    The patches of all templates lie one after another; ``template_offsets`` cuts them apart.
+
+    Args:
+        projection: fitted PCA, from C to d dimensions.
+        words: (k, d) visual words.
+        idf: (k,) inverse document frequencies.
+        template_bow: (T, k) L2-normalised bags of words of the templates.
+        descriptors: (M, d) projected descriptors of the valid patches of all templates.
+        points_model: (M, 3) their 3D points, mesh units.
+        patch_index: (M,) int, cell ``row * grid + column`` of each patch in its template.
+        template_offsets: (T + 1,) int64; template t owns patches ``offsets[t]`` to ``offsets[t + 1]``.
+        T_template_from_model: (T, 4, 4) poses of the object in the templates' cameras.
+        K_template: (T, 3, 3) intrinsics of the templates.
+        template_cls: (T, C') global descriptors, or None.
+        info: facts that are not tensors.
+    """
+
+    words: Tensor
+    idf: Tensor
+    template_bow: Tensor
+    descriptors: Tensor
+    points_model: Tensor
+    patch_index: Tensor
+    template_offsets: Tensor
+    T_template_from_model: Tensor
+    K_template: Tensor
+    template_cls: Tensor | None
+
+    def __init__(
+        self,
+        projection: PcaProjection,
+        words: Tensor,
+        idf: Tensor,
+        template_bow: Tensor,
+        descriptors: Tensor,
+        points_model: Tensor,
+        patch_index: Tensor,
+        template_offsets: Tensor,
+        T_template_from_model: Tensor,
+        K_template: Tensor,
+        template_cls: Tensor | None,
+        info: RepresentationInfo,
+    ) -> None:
+        super().__init__()
+        self.projection = projection
+        self.register_buffer("words", words)
+        self.register_buffer("idf", idf)
+        self.register_buffer("template_bow", template_bow)
+        self.register_buffer("descriptors", descriptors)
+        self.register_buffer("points_model", points_model)
+        self.register_buffer("patch_index", patch_index)
+        self.register_buffer("template_offsets", template_offsets)
+        self.register_buffer("T_template_from_model", T_template_from_model)
+        self.register_buffer("K_template", K_template)
+        self.register_buffer("template_cls", template_cls)
+        self.info = info
+        counts = template_offsets.diff()
+        # Kept on the host: the padded size of a template must not cost a device read at every call.
+        self.max_patches = int(counts.max()) if len(counts) else 0
+
+    @property
+    def num_templates(self) -> int:
+        """Number of templates T."""
+        return len(self.template_offsets) - 1
+
+    def gather_templates(self, index: Tensor) -> TemplatePatches:
+        """Patches of templates: any shape of template indices (...) → (..., Q, ·), Q the largest template's count.
+
+        Differentiable w.r.t. the buffers ``descriptors`` and ``points_model``.
+        """
+        start = self.template_offsets[index]
+        count = self.template_offsets[index + 1] - start
+        position = torch.arange(self.max_patches, device=index.device)
+        valid = position < count.unsqueeze(-1)
+        rows = torch.where(valid, start.unsqueeze(-1) + position, torch.zeros_like(position))
+        keep = valid.unsqueeze(-1)
+        descriptors = torch.where(keep, self.descriptors[rows], self.descriptors.new_zeros(()))
+        points_model = torch.where(keep, self.points_model[rows], self.points_model.new_zeros(()))
+        cell = self.patch_index[rows].long()
+        columns_rows = torch.stack([cell % self.info.grid, cell // self.info.grid], dim=-1)
+        pixels = columns_rows.to(self.points_model.dtype) * self.info.stride + self.info.offset
+        return TemplatePatches(descriptors, points_model, pixels, valid)
+
+    def memory_bytes(self) -> dict[str, int]:
+        """Bytes taken by each part, and their ``total``."""
+        parts = {name: tensor.numel() * tensor.element_size() for name, tensor in self.named_buffers()}
+        return parts | {"total": sum(parts.values())}
+
+    def check_extractor(self, extractor: PatchExtractor) -> None:
+        """Refuse an extractor whose descriptors cannot be compared with this representation's.
+
+        Raises:
+            ValueError: names the settings that differ.
+        """
+        expected, got = self.info.extractor, extractor.fingerprint()
+        if expected != got:
+            names = sorted(set(expected) | set(got))
+            differences = ", ".join(
+                f"{name}: {expected.get(name)!r} here, {got.get(name)!r} given"
+                for name in names
+                if expected.get(name) != got.get(name)
+            )
+            raise ValueError(
+                f"the representation of {self.info.name!r} was made with another extractor ({differences}); "
+                "onboard the object again with this one"
+            )
+
+    def save(self, path: str | Path) -> None:
+        """Write one safetensors file whose header holds the facts as JSON. Atomic."""
+        # Contiguous copies: safetensors refuses views that share memory.
+        tensors = {name: t.detach().cpu().contiguous() for name, t in self.state_dict().items()}
+        metadata = {"foundpose": json.dumps(asdict(self.info), sort_keys=True)}
+        write_atomically(Path(path), lambda temporary: save_file(tensors, str(temporary), metadata=metadata))
+
+    @classmethod
+    def load(
+        cls,
+        path: str | Path,
+        device: torch.device | str = "cpu",
+        extractor: PatchExtractor | None = None,
+    ) -> Self:
+        """Read a representation.
+
+        Args:
+            path: a file written by :meth:`save`.
+            device: where the buffers go.
+            extractor: when given, the representation must have been made with an extractor like it.
+
+        Raises:
+            FileNotFoundError: no such file.
+            ValueError: not a representation, of another schema version, or made with another extractor.
+        """
+        path = Path(path)
+        info = read_info(path)
+        with safe_open(str(path), framework="pt", device=str(device)) as file:
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
+        representation = cls(info=info, **_constructor_tensors(tensors, path))
+        if extractor is not None:
+            representation.check_extractor(extractor)
+        return representation
+
+
+def read_info(path: str | Path) -> RepresentationInfo:
+    """Read the facts of a representation's file without its tensors.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: not a representation, or one of another schema version.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"no object representation at {path}; onboard the object first")
+    try:
+        with safe_open(str(path), framework="pt") as file:
+            metadata = file.metadata() or {}
+    except SafetensorError as error:
+        raise ValueError(
+            f"{path} is not a readable safetensors file ({error}); onboard the object again"
+        ) from error
+    if "foundpose" not in metadata:
+        raise ValueError(f"{path} holds no object representation (no 'foundpose' entry in its header)")
+    facts = json.loads(metadata["foundpose"])
+    version = facts.get("schema_version")
+    if version != SCHEMA_VERSION:
+        raise ValueError(
+            f"{path} has schema version {version}, this library reads {SCHEMA_VERSION}; onboard the object again"
+        )
+    return RepresentationInfo(**facts)
+
+
+def _constructor_tensors(
+    tensors: Mapping[str, Tensor], path: Path
+) -> dict[str, Tensor | PcaProjection | None]:
+    """Sort a file's tensors into constructor arguments."""
+    projection_state = {
+        name.removeprefix("projection."): t for name, t in tensors.items() if name.startswith("projection.")
+    }
+    names = [name for name in ObjectRepresentation.__annotations__ if name != "template_cls"]
+    missing = [name for name in names if name not in tensors]
+    if missing or "components" not in projection_state:
+        raise ValueError(f"{path} lacks the tensors {missing or ['projection.components']}; onboard again")
+    projection = PcaProjection(len(projection_state["components"]))
+    projection.load_state_dict(projection_state)
+    projection.to(projection_state["components"])
+    return {
+        "projection": projection,
+        "template_cls": tensors.get("template_cls"),
+        **{name: tensors[name] for name in names},
+    }

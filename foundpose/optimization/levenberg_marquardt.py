@@ -1,0 +1,148 @@
+"""Batched Levenberg-Marquardt on SE(3)."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from foundpose.geometry.transforms import se3_exp
+
+
+class NormalEquations(NamedTuple):
+    """A least-squares problem linearised at a pose, for the left update ``T ← exp(δ) @ T``.
+
+    Attributes:
+        cost: (B,) the cost ``½ Σ ρ``; infinite where the pose is not admissible.
+        H: (B, 6, 6) Gauss-Newton approximation of the cost's second derivative in δ.
+        g: (B, 6) the cost's gradient in δ.
+    """
+
+    cost: Tensor
+    H: Tensor
+    g: Tensor
+
+
+class LevenbergMarquardtResult(NamedTuple):
+    """Outcome of :func:`levenberg_marquardt`.
+
+    Attributes:
+        T: (B, 4, 4) optimised poses.
+        cost: (B,) cost at ``T``; never above ``initial_cost``.
+        initial_cost: (B,) cost at the initial poses.
+        iterations: (B,) int64, steps tried for each sample.
+        converged: (B,) bool, the predicted decrease fell below the tolerance.
+        failed: (B,) bool, the problem cannot be solved: a cost, H or g that is not finite at the initial pose, or
+            an H of zeros (no data). Such a pose is returned as it came.
+        H: (B, 6, 6) Gauss-Newton matrix at ``T``.
+    """
+
+    T: Tensor
+    cost: Tensor
+    initial_cost: Tensor
+    iterations: Tensor
+    converged: Tensor
+    failed: Tensor
+    H: Tensor
+
+
+def levenberg_marquardt(
+    evaluate: Callable[[Tensor], NormalEquations],
+    T: Tensor,
+    *,
+    max_iterations: int = 20,
+    initial_damping: float = 1e-3,
+    tolerance: float | None = None,
+    floor: float | Tensor = 0.0,
+    chunk: int = 5,
+) -> LevenbergMarquardtResult:
+    """Minimise one cost per sample over rigid transformations.
+
+    Each sample has its own damping, which multiplies the diagonal of H (Marquardt), so the steps do not depend
+    on the units of length and angle. A step is kept where the cost does not rise; there the damping shrinks
+    tenfold, elsewhere it grows tenfold. A sample is finished when the decrease that its linearisation predicts
+    is below ``tolerance`` times its cost or below ``floor``; from then on it does not move by a single bit,
+    whatever its neighbours do.
+
+    Args:
+        evaluate: gives the :class:`NormalEquations` of all samples at poses (B, 4, 4). Sample b of its output
+            may depend on sample b of its input only.
+        T: (B, 4, 4) initial poses.
+        max_iterations: upper limit on the steps tried.
+        initial_damping: first damping factor.
+        tolerance: relative decrease of the cost that counts as converged; None means four units of rounding.
+        floor: decrease of the cost that is mere rounding, a number or (B,); data that fit exactly need it.
+        chunk: iterations between two looks at whether all samples are finished (each look waits for the device).
+
+    Returns:
+        A :class:`LevenbergMarquardtResult`.
+
+    Raises:
+        ValueError: ``T`` is not (B, 4, 4) or a setting is out of range.
+
+    Differentiable w.r.t. ``T`` and whatever ``evaluate`` closes over, through the steps taken (unrolled); which
+    steps are kept, and the damping, count as constants.
+
+    Source: Marquardt, "An algorithm for least-squares estimation of nonlinear parameters", 1963.
+    """
+    if T.dim() != 3 or T.shape[-2:] != (4, 4):
+        raise ValueError(f"T must have shape (B, 4, 4), got {tuple(T.shape)}")
+    if max_iterations < 0 or chunk < 1 or not initial_damping > 0:
+        raise ValueError(
+            "max_iterations must be at least 0, chunk at least 1 and initial_damping positive, "
+            f"got {max_iterations}, {chunk} and {initial_damping}"
+        )
+    eps = torch.finfo(T.dtype).eps
+    relative = 4.0 * eps if tolerance is None else tolerance
+
+    cost, H, g = evaluate(T)
+    initial_cost = cost
+    damping = torch.full_like(cost.detach(), initial_damping)
+    iterations = torch.zeros(T.shape[0], dtype=torch.int64, device=T.device)
+    converged = torch.zeros(T.shape[0], dtype=torch.bool, device=T.device)
+    failed = ~(_finite(cost, H, g) & (H.diagonal(dim1=-2, dim2=-1).amax(-1) > 0))
+
+    for iteration in range(max_iterations):
+        active = ~(converged | failed)
+        if iteration % chunk == 0 and not bool(active.any()):
+            break
+        step, solved = _solve(H, g, damping)
+        predicted = -((g + 0.5 * (H @ step.unsqueeze(-1)).squeeze(-1)) * step).sum(-1).detach()
+        finished = solved & (predicted <= relative * cost.detach() + floor)
+
+        T_new = se3_exp(step) @ T
+        cost_new, H_new, g_new = evaluate(T_new)
+        accepted = active & solved & (cost_new <= cost) & _finite(cost_new, H_new, g_new)
+        T = torch.where(accepted[:, None, None], T_new, T)
+        cost = torch.where(accepted, cost_new, cost)
+        H = torch.where(accepted[:, None, None], H_new, H)
+        g = torch.where(accepted[:, None], g_new, g)
+
+        damping = torch.where(accepted, damping * 0.1, damping * 10.0).clamp(1e-10, 1e10)
+        iterations = iterations + active.to(iterations.dtype)
+        converged = converged | (active & finished)
+    return LevenbergMarquardtResult(T, cost, initial_cost, iterations, converged, failed, H)
+
+
+def _finite(cost: Tensor, H: Tensor, g: Tensor) -> Tensor:
+    return torch.isfinite(cost) & torch.isfinite(H).all(-1).all(-1) & torch.isfinite(g).all(-1)
+
+
+def _solve(H: Tensor, g: Tensor, damping: Tensor) -> tuple[Tensor, Tensor]:
+    """Damped step (B, 6) and whether it could be solved for (B,); the step is zero where it could not."""
+    diagonal = H.diagonal(dim1=-2, dim2=-1)
+    usable = _finite(damping, H, g) & (diagonal.amax(-1) > 0)
+    # Unit matrices stand in for unusable systems, so that no NaN enters the graph.
+    H = torch.where(usable[:, None, None], H, torch.eye(6, dtype=H.dtype, device=H.device))
+    g = torch.where(usable[:, None], g, torch.zeros_like(g))
+    diagonal = H.diagonal(dim1=-2, dim2=-1)
+    smallest = torch.finfo(H.dtype).eps * diagonal.amax(-1, keepdim=True)
+    scaling = diagonal.clamp(min=smallest).detach()
+    # Solving in the scaled variables keeps the condition number free of the units.
+    root = scaling.sqrt()
+    scaled = H / (root[:, :, None] * root[:, None, :]) + torch.diag_embed(damping[:, None].expand_as(root))
+    factor, info = torch.linalg.cholesky_ex(scaled)
+    solved = usable & (info == 0)
+    factor = torch.where(solved[:, None, None], factor, torch.eye(6, dtype=H.dtype, device=H.device))
+    step = -torch.cholesky_solve((g / root).unsqueeze(-1), factor).squeeze(-1) / root
+    return torch.where(solved[:, None], step, torch.zeros_like(step)), solved

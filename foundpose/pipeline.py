@@ -1,0 +1,327 @@
+"""The composed method: from images and masks to coarse poses."""
+
+from collections.abc import Sequence
+from enum import IntEnum
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from foundpose.features.base import PatchExtractor, PatchFeatures
+from foundpose.geometry import Crops, PerspectiveCrop, invert_transform
+from foundpose.matching import PatchMatcher
+from foundpose.onboarding import ObjectRepresentation
+from foundpose.pnp import PnpStatus, RansacPnp
+from foundpose.retrieval import QueryPatches, RetrievedTemplates, TemplateRetriever
+
+
+class PoseStatus(IntEnum):
+    """Why a crop has no pose. The codes of :class:`PnpStatus` keep their values."""
+
+    OK = PnpStatus.OK
+    TOO_FEW_CORRESPONDENCES = PnpStatus.TOO_FEW_CORRESPONDENCES
+    DEGENERATE = PnpStatus.DEGENERATE
+    BEHIND_CAMERA = PnpStatus.BEHIND_CAMERA
+    TOO_FEW_INLIERS = PnpStatus.TOO_FEW_INLIERS
+    UNUSABLE_MASK = 100
+    NO_PATCHES = 101
+
+
+class Correspondences(NamedTuple):
+    """2D-3D correspondences of B crops with h retrieved templates each.
+
+    Attributes:
+        points_image: (B, P, 2) patch centres in the crop, pixels.
+        points_model: (B, h, P, 3) matched points, mesh units.
+        pixels_template: (B, h, P, 2) centres of the matched template patches, pixels of the template.
+        distance: (B, h, P) descriptor distances, +inf where not valid.
+        valid: (B, h, P) bool.
+    """
+
+    points_image: Tensor
+    points_model: Tensor
+    pixels_template: Tensor
+    distance: Tensor
+    valid: Tensor
+
+
+class PoseHypotheses(NamedTuple):
+    """One pose for each crop and retrieved template.
+
+    Attributes:
+        T_crop_from_model: (B, h, 4, 4), mesh units.
+        inliers: (B, h, P) bool.
+        num_inliers: (B, h).
+        status: (B, h) codes of :class:`PoseStatus`.
+    """
+
+    T_crop_from_model: Tensor
+    inliers: Tensor
+    num_inliers: Tensor
+    status: Tensor
+
+
+class PoseEstimates(NamedTuple):
+    """Poses of a batch of crops, and what they were made from.
+
+    Attributes:
+        T_camera_from_model: (B, 4, 4), mesh units; finite but meaningless where not valid.
+        score: (B,) share of the crop's patches that are inliers, in [0, 1].
+        num_inliers: (B,) inlier correspondences, the quality by which the best of h hypotheses is chosen.
+        valid: (B,) bool.
+        status: (B,) codes of :class:`PoseStatus`.
+        best: (B,) which hypothesis was chosen.
+        crops: the perspective crops.
+        query: the crops' patches.
+        templates: the retrieved templates.
+        correspondences: the matches.
+        hypotheses: the poses of all retrieved templates.
+    """
+
+    T_camera_from_model: Tensor
+    score: Tensor
+    num_inliers: Tensor
+    valid: Tensor
+    status: Tensor
+    best: Tensor
+    crops: Crops
+    query: QueryPatches
+    templates: RetrievedTemplates
+    correspondences: Correspondences
+    hypotheses: PoseHypotheses
+
+
+class FoundPose(nn.Module):
+    """Coarse 6D pose of onboarded objects (paper, Section 3).
+
+    Args:
+        crop: cuts perspective crops.
+        extractor: describes their patches; must be the one that the objects were onboarded with.
+        retriever: finds similar templates.
+        matcher: matches patches of crop and template.
+        pnp: estimates a pose from each template's correspondences.
+    """
+
+    def __init__(
+        self,
+        crop: PerspectiveCrop,
+        extractor: PatchExtractor,
+        retriever: TemplateRetriever,
+        matcher: PatchMatcher,
+        pnp: RansacPnp,
+    ) -> None:
+        super().__init__()
+        self.crop = crop
+        self.extractor = extractor
+        self.retriever = retriever
+        self.matcher = matcher
+        self.pnp = pnp
+
+    def forward(
+        self,
+        images: Tensor,
+        K: Tensor,
+        objects: Sequence[ObjectRepresentation] | ObjectRepresentation,
+        masks: Tensor | None = None,
+        boxes: Tensor | None = None,
+        image_index: Tensor | None = None,
+        object_index: Tensor | None = None,
+    ) -> PoseEstimates:
+        """Estimate one pose for each mask (or box).
+
+        Args:
+            images: (N, 3, H, W) RGB in [0, 1].
+            K: (N, 3, 3) intrinsics in pixels (integer coordinates are pixel centres).
+            objects: representations of the objects; one may be given without a list.
+            masks: (B, H, W), non-zero on the object.
+            boxes: (B, 4) as ``(left, top, right, bottom)`` pixel edges, in place of masks or beside them.
+            image_index: (B,) which image each mask belongs to; may be left out where B == N.
+            object_index: (B,) which object each mask shows; may be left out for a single object.
+
+        Raises:
+            ValueError: shapes that do not fit, or an object that was onboarded with another extractor or size.
+
+        Differentiable w.r.t. ``images``, ``K``, ``boxes`` and the extractor's parameters as far as the stages
+        are: crop, descriptors, similarities and descriptor distances are; the choice of templates, of matches
+        and of RANSAC samples is constant.
+        """
+        objects = [objects] if isinstance(objects, ObjectRepresentation) else list(objects)
+        self._check_objects(objects)
+        crops = self.crop(images, K, masks, boxes, image_index)
+        if len(crops.images) == 0:
+            raise ValueError("there is nothing to estimate: masks or boxes have length 0")
+        members = _members(object_index, len(crops.images), len(objects))
+        features = self.extractor(crops.images)
+        raw = select_query_patches(features, crops, self.extractor)
+
+        query, templates, correspondences = self._match(objects, members, raw)
+        hypotheses = self._solve(correspondences, crops.K_crop)
+        return _choose(crops, query, templates, correspondences, hypotheses)
+
+    def _check_objects(self, objects: list[ObjectRepresentation]) -> None:
+        if not objects:
+            raise ValueError("objects is empty: give at least one object representation")
+        dimensions = {len(representation.projection.components) for representation in objects}
+        if len(dimensions) > 1:
+            raise ValueError(f"objects must share one PCA dimension, got {sorted(dimensions)}")
+        for representation in objects:
+            representation.check_extractor(self.extractor)
+            if representation.info.image_size != self.crop.size:
+                raise ValueError(
+                    f"the templates of {representation.info.name!r} are {representation.info.image_size} px wide, "
+                    f"the crops {self.crop.size} px; use one size for both"
+                )
+
+    def _match(
+        self, objects: list[ObjectRepresentation], members: list[Tensor], raw: QueryPatches
+    ) -> tuple[QueryPatches, RetrievedTemplates, Correspondences]:
+        """Retrieve and match object by object: the crops of one object share its words and templates."""
+        parts: list[tuple[QueryPatches, RetrievedTemplates, Correspondences]] = []
+        for representation, crop_index in zip(objects, members, strict=True):
+            if len(crop_index) == 0:
+                continue
+            query = QueryPatches(*(None if part is None else part[crop_index] for part in raw))
+            descriptors = query.descriptors.to(representation.projection.components.dtype)
+            query = query._replace(descriptors=representation.projection(descriptors))
+            templates = self.retriever(query, representation)
+            patches = representation.gather_templates(templates.index)
+            template_valid = patches.valid & templates.valid.unsqueeze(-1)
+            matches = self.matcher(
+                query.descriptors, query.valid, patches.descriptors, template_valid, query.pixels
+            )
+            chosen = matches.template_patch.unsqueeze(-1)
+            parts.append(
+                (
+                    query,
+                    templates,
+                    Correspondences(
+                        points_image=query.pixels,
+                        points_model=patches.points_model.gather(2, chosen.expand(-1, -1, -1, 3)).to(
+                            query.pixels
+                        ),
+                        pixels_template=patches.pixels.gather(2, chosen.expand(-1, -1, -1, 2)).to(
+                            query.pixels
+                        ),
+                        distance=matches.distance,
+                        valid=matches.valid,
+                    ),
+                )
+            )
+        # Back to the order of the batch.
+        order = torch.cat(members).argsort()
+        queries, retrieved, matched = zip(*parts, strict=True)
+        return (
+            QueryPatches(*_join(queries, order)),
+            RetrievedTemplates(*_join(retrieved, order)),
+            Correspondences(*_join(matched, order)),
+        )
+
+    def _solve(self, correspondences: Correspondences, K_crop: Tensor) -> PoseHypotheses:
+        """PnP for all crops and templates as one batch."""
+        B, h, P = correspondences.valid.shape
+        result = self.pnp(
+            correspondences.points_image.unsqueeze(1).expand(-1, h, -1, -1).reshape(B * h, P, 2),
+            correspondences.points_model.reshape(B * h, P, 3),
+            K_crop.unsqueeze(1).expand(-1, h, -1, -1).reshape(B * h, 3, 3),
+            correspondences.valid.reshape(B * h, P),
+        )
+        return PoseHypotheses(
+            T_crop_from_model=result.T_camera_from_model.reshape(B, h, 4, 4),
+            inliers=result.inliers.reshape(B, h, P),
+            num_inliers=result.num_inliers.reshape(B, h),
+            status=result.status.reshape(B, h),
+        )
+
+
+def select_query_patches(features: PatchFeatures, crops: Crops, extractor: PatchExtractor) -> QueryPatches:
+    """Patches whose centre lies in the crop's mask, first and padded to the most of any crop in the batch.
+
+    Args:
+        features: patches (B, C, h, w) of the crops.
+        crops: the crops.
+        extractor: knows where the patches are centred.
+
+    Returns:
+        Raw descriptors (B, P, C), pixels, validity and the global descriptors.
+
+    Differentiable w.r.t. the features.
+    """
+    size = crops.images.shape[-1]
+    pixels = extractor.patch_centers(size, crops.images.device, crops.images.dtype)
+    grid = (2 * pixels + 1) / size - 1
+    share = F.grid_sample(
+        crops.masks[:, None], grid.expand(len(crops.masks), -1, -1, -1), align_corners=False
+    )
+    valid = (share.flatten(1) > 0.5) & crops.valid[:, None]
+    if features.patches.shape[-2:] != pixels.shape[:2]:
+        raise ValueError(
+            f"the extractor declares a grid of {tuple(pixels.shape[:2])} patches for crops of {size} px but "
+            f"returned {tuple(features.patches.shape[-2:])}"
+        )
+    # One read of the batch's largest count; a stable sort keeps the patches in raster order.
+    most = max(int(valid.sum(dim=1).max()), 1) if len(valid) else 1
+    order = torch.argsort(~valid, dim=1, stable=True)[:, :most]
+    descriptors = features.patches.flatten(2).transpose(1, 2)
+    descriptors = descriptors.gather(1, order.unsqueeze(-1).expand(-1, -1, descriptors.shape[-1]))
+    return QueryPatches(descriptors, pixels.reshape(-1, 2)[order], valid.gather(1, order), features.cls)
+
+
+def _choose(
+    crops: Crops,
+    query: QueryPatches,
+    templates: RetrievedTemplates,
+    correspondences: Correspondences,
+    hypotheses: PoseHypotheses,
+) -> PoseEstimates:
+    """Keep the hypothesis with the most inliers; of equal ones, that of the more similar template."""
+    B, h = hypotheses.num_inliers.shape
+    solved = hypotheses.status == PoseStatus.OK
+    quality = torch.where(solved, hypotheses.num_inliers, torch.full_like(hypotheses.num_inliers, -1))
+    rank = torch.arange(h, device=quality.device)
+    best = (quality * h + (h - 1 - rank)).argmax(dim=1)
+    row = torch.arange(B, device=best.device)
+    status = hypotheses.status[row, best]
+    status = torch.where(query.valid.any(dim=1), status, torch.full_like(status, PoseStatus.NO_PATCHES))
+    status = torch.where(crops.valid, status, torch.full_like(status, PoseStatus.UNUSABLE_MASK))
+    valid = status == PoseStatus.OK
+    num_inliers = hypotheses.num_inliers[row, best] * valid
+    return PoseEstimates(
+        T_camera_from_model=invert_transform(crops.T_crop_from_camera)
+        @ hypotheses.T_crop_from_model[row, best],
+        score=num_inliers / query.valid.sum(dim=1).clamp(min=1),
+        num_inliers=num_inliers,
+        valid=valid,
+        status=status,
+        best=best,
+        crops=crops,
+        query=query,
+        templates=templates,
+        correspondences=correspondences,
+        hypotheses=hypotheses,
+    )
+
+
+def _members(object_index: Tensor | None, count: int, num_objects: int) -> list[Tensor]:
+    """Crops of each object, as index tensors."""
+    if object_index is None:
+        if num_objects != 1:
+            raise ValueError(f"object_index (B,) is needed to tell {num_objects} objects apart")
+        return [torch.arange(count)]
+    if object_index.shape != (count,) or object_index.is_floating_point():
+        raise ValueError(
+            f"object_index must be ({count},) integers, got {tuple(object_index.shape)} {object_index.dtype}"
+        )
+    labels = object_index.cpu()
+    if count and (int(labels.min()) < 0 or int(labels.max()) >= num_objects):
+        raise ValueError(f"object_index must lie in [0, {num_objects}), got {labels.tolist()}")
+    return [torch.nonzero(labels == i).flatten() for i in range(num_objects)]
+
+
+def _join(parts: Sequence[Sequence[Tensor | None]], order: Tensor) -> list[Tensor | None]:
+    """Concatenate tuples of tensors field by field and put the rows in order."""
+    joined: list[Tensor | None] = []
+    for field in zip(*parts, strict=True):
+        tensors = [tensor for tensor in field if tensor is not None]
+        joined.append(torch.cat(tensors)[order.to(tensors[0].device)] if tensors else None)
+    return joined

@@ -1,0 +1,1 @@
+"""Visual words, bags of words and template retrieval."""

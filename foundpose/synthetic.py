@@ -1,0 +1,157 @@
+"""Procedural objects and cluttered pictures of them, for demos, tests and training without data."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+import trimesh
+from PIL import Image, ImageDraw
+from torch import Tensor
+
+from foundpose.geometry import (
+    intrinsics_matrix,
+    make_transform,
+    pixel_rays,
+    project_to_rotation,
+)
+from foundpose.rendering import Mesh, RaycastRenderer, Renderer
+
+
+class SyntheticScene(NamedTuple):
+    """A picture with known truth.
+
+    Attributes:
+        image: (3, H, W) in [0, 1].
+        K: (3, 3) intrinsics.
+        mask: (H, W) bool, visible part of the object.
+        T_camera_from_model: (4, 4) true pose.
+    """
+
+    image: Tensor
+    K: Tensor
+    mask: Tensor
+    T_camera_from_model: Tensor
+
+
+def procedural_mesh(seed: int, diameter: float = 120.0, subdivisions: int = 6) -> Mesh:
+    """A smooth, irregular body with a fine-grained coloured pattern, different for every seed.
+
+    Args:
+        seed: any integer.
+        diameter: about the size of the body, in the unit that the mesh shall have.
+        subdivisions: of an icosahedron; 6 gives 41 k vertices.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    sphere = trimesh.creation.icosphere(subdivisions=subdivisions)
+    directions = torch.from_numpy(np.array(sphere.vertices, dtype=np.float64))
+
+    def waves(count: int, frequency: float) -> Tensor:
+        """A random smooth function on the sphere with values of about unit size."""
+        k = torch.randn(3, count, generator=generator, dtype=torch.float64) * frequency
+        phase = torch.rand(count, generator=generator, dtype=torch.float64) * 2 * math.pi
+        return torch.cos(directions @ k + phase).mean(dim=1) * math.sqrt(2 * count)
+
+    radius = 1.0 + 0.16 * waves(12, 2.0) + 0.04 * waves(24, 5.0)
+    stretch = 0.6 + 0.5 * torch.rand(3, generator=generator, dtype=torch.float64)
+    vertices = directions * radius.clamp(min=0.4)[:, None] * stretch
+    extent = (vertices.amax(0) - vertices.amin(0)).max()
+    vertices = vertices * (diameter / extent)
+
+    # Cells of two sizes, each with a colour of its own: corners and edges at the scales of the patches. The cells'
+    # brightness differs as much as their hue, for descriptors that see grey only.
+    color = torch.ones(len(vertices), 3, dtype=torch.float64)
+    for cells, darkest in ((60, 0.25), (350, 0.15)):
+        centres = F.normalize(torch.randn(cells, 3, generator=generator, dtype=torch.float64), dim=1)
+        hue = 0.5 + 0.5 * torch.rand(cells, 3, generator=generator, dtype=torch.float64)
+        value = (
+            darkest + (1 - darkest) * torch.rand(cells, 1, generator=generator, dtype=torch.float64).round()
+        )
+        color *= (hue * value)[(directions @ centres.T).argmax(dim=1)]
+    color = color.sqrt()
+    return Mesh(
+        vertices=vertices.float(),
+        faces=torch.from_numpy(np.array(sphere.faces, dtype=np.int64)),
+        vertex_colors=color.float(),
+    )
+
+
+def random_rotation(generator: torch.Generator) -> Tensor:
+    """A uniformly random rotation (3, 3), float64."""
+    # The rotation nearest to a Gaussian matrix is uniform on SO(3), up to reflections, which are turned over.
+    return project_to_rotation(torch.randn(3, 3, generator=generator, dtype=torch.float64))
+
+
+def cluttered_scene(
+    mesh: Mesh,
+    seed: int,
+    height: int = 480,
+    width: int = 640,
+    occlusion: bool = True,
+    renderer: Renderer | None = None,
+) -> SyntheticScene:
+    """Picture of an object in front of and behind clutter, under another light than the templates', with noise.
+
+    Args:
+        mesh: the object.
+        seed: of everything that is random.
+        height: of the picture in pixels.
+        width: of the picture in pixels.
+        occlusion: hide a corner of the object.
+        renderer: draws the object; by default a ray caster with much ambient light.
+    """
+    generator = torch.Generator().manual_seed(seed)
+
+    def uniform(low: float, high: float) -> float:
+        return low + (high - low) * float(torch.rand((), generator=generator))
+
+    focal = 0.95 * width
+    K = intrinsics_matrix(focal, focal, width / 2 - 0.5 + uniform(-9, 9), height / 2 - 0.5 + uniform(-9, 9))
+    # The object takes about a third of the picture's height.
+    distance = mesh.diameter * focal / (0.36 * height) * uniform(0.85, 1.25)
+    pixel = torch.tensor([[width * uniform(0.3, 0.7), height * uniform(0.3, 0.7)]])
+    R = random_rotation(generator)
+    centre = (mesh.bounds[0] + mesh.bounds[1]).double() / 2
+    t = (pixel_rays(pixel, K)[0] * distance).double() - R @ centre
+    T = make_transform(R, t).float()
+
+    renderer = renderer or RaycastRenderer(ambient=0.75)
+    render = renderer(mesh, T[None], K[None], (height, width))
+    mask = render.mask[0]
+    image = torch.where(mask, render.rgb[0], _clutter(height, width, generator, shapes=150))
+    if occlusion:
+        image, mask = _hide_corner(image, mask, generator)
+    gain = torch.tensor([uniform(0.85, 1.1) for _ in range(3)])[:, None, None]
+    image = image * gain + 0.015 * torch.randn(image.shape, generator=generator)
+    return SyntheticScene(image.clamp(0, 1), K, mask, T)
+
+
+def _clutter(height: int, width: int, generator: torch.Generator, shapes: int) -> Tensor:
+    """A picture full of coloured shapes."""
+    draws = torch.rand(shapes, 8, generator=generator).tolist()
+    picture = Image.new("RGB", (width, height), (90, 95, 100))
+    draw = ImageDraw.Draw(picture)
+    for x, y, w, h, red, green, blue, kind in draws:
+        box = (x * width - 40 * w, y * height - 40 * h, x * width + 5 + 60 * w, y * height + 5 + 60 * h)
+        color = (int(255 * red), int(255 * green), int(255 * blue))
+        if kind < 0.4:
+            draw.rectangle(box, fill=color)
+        elif kind < 0.8:
+            draw.ellipse(box, fill=color)
+        else:
+            draw.line(box, fill=color, width=3)
+    return torch.from_numpy(np.asarray(picture, dtype=np.float32) / 255.0).permute(2, 0, 1)
+
+
+def _hide_corner(image: Tensor, mask: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Put a flat shape over about an eighth of the object."""
+    rows, columns = torch.nonzero(mask, as_tuple=True)
+    angle = 2 * math.pi * float(torch.rand((), generator=generator))
+    along = columns * math.cos(angle) + rows * math.sin(angle)
+    hidden = along > along.float().quantile(0.88)
+    cover = torch.zeros_like(mask)
+    cover[rows[hidden], columns[hidden]] = True
+    cover = F.max_pool2d(cover.float()[None], 9, stride=1, padding=4)[0] > 0
+    color = torch.rand(3, 1, 1, generator=generator)
+    return torch.where(cover, color, image), mask & ~cover

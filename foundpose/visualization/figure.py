@@ -1,0 +1,114 @@
+"""One figure that tells how a pose came about."""
+
+from pathlib import Path
+
+import torch
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from foundpose.io import write_atomically
+from foundpose.onboarding import ObjectRepresentation
+from foundpose.pipeline import PoseEstimates, PoseStatus
+from foundpose.rendering import Mesh, Renderer
+from foundpose.visualization.overlay import COARSE, TRUTH, draw_axes, draw_contour
+
+_MOST_LINES = 60
+
+
+def overlay_pose(
+    image: Tensor,
+    K: Tensor,
+    mesh: Mesh,
+    renderer: Renderer,
+    T_camera_from_model: Tensor,
+    T_true: Tensor | None = None,
+) -> Tensor:
+    """Draw the contour (coarse: blue, truth: red) and the axes of a pose on its picture (3, H, W)."""
+    size = (int(image.shape[1]), int(image.shape[2]))
+    drawn = image
+    for T, color in ((T_true, TRUTH), (T_camera_from_model, COARSE)):
+        if T is not None:
+            mask = renderer(mesh, T[None].float(), K[None].float(), size).mask[0].to(image.device)
+            drawn = draw_contour(drawn, mask, color)
+    return draw_axes(drawn, T_camera_from_model, K, length=0.5 * float(mesh.diameter))
+
+
+@torch.no_grad()
+def save_estimate_figure(
+    path: str | Path,
+    image: Tensor,
+    K: Tensor,
+    estimates: PoseEstimates,
+    index: int,
+    representation: ObjectRepresentation,
+    mesh: Mesh,
+    renderer: Renderer,
+    T_true: Tensor | None = None,
+) -> None:
+    """Write a figure: pose on the picture, crop, retrieved templates, matches of the best template.
+
+    Args:
+        path: a picture file.
+        image: (3, H, W) the photograph.
+        K: (3, 3) its intrinsics.
+        estimates: a batch of estimates.
+        index: which estimate to show.
+        representation: the object it belongs to.
+        mesh: the object's mesh.
+        renderer: draws contours and templates.
+        T_true: (4, 4) true pose, or None.
+    """
+    e = estimates
+    templates = e.templates.index[index].cpu()
+    best = int(e.best[index])
+    size = representation.info.image_size
+    views = renderer(
+        mesh,
+        representation.T_template_from_model[templates].float().cpu(),
+        representation.K_template[templates].float().cpu(),
+        (size, size),
+    ).rgb
+    status = PoseStatus(int(e.status[index]))
+
+    figure = Figure(figsize=(14, 11), layout="constrained")
+    top, middle, bottom = figure.subfigures(3, 1, height_ratios=[5, 2.6, 5])
+    left, right = top.subplots(1, 2, width_ratios=[image.shape[2] / image.shape[1], 1])
+    drawn = image
+    if bool(e.valid[index]):
+        drawn = overlay_pose(image, K, mesh, renderer, e.T_camera_from_model[index].cpu(), T_true)
+    _show(left, drawn, f"{representation.info.name}: {status.name}, {int(e.num_inliers[index])} inliers")
+    crop = draw_contour(
+        e.crops.images[index].cpu(), e.crops.masks[index].cpu() > 0.5, (1.0, 1.0, 1.0), width=1
+    )
+    _show(right, crop, "crop and mask")
+    for rank, axes in enumerate(middle.subplots(1, len(templates), squeeze=False)[0]):
+        inliers = int(e.hypotheses.num_inliers[index, rank])
+        similarity = float(e.templates.similarity[index, rank])
+        _show(axes, views[rank], f"{similarity:.2f}, {inliers} inliers" + (" (best)" if rank == best else ""))
+    _show_matches(bottom.subplots(1, 1), estimates, index, best, views[best])
+    write_atomically(Path(path), lambda temporary: figure.savefig(temporary, dpi=70))
+
+
+def _show_matches(axes: Axes, e: PoseEstimates, index: int, best: int, template: Tensor) -> None:
+    """Crop and template side by side, joined by the inlier matches."""
+    size = template.shape[-1]
+    _show(
+        axes,
+        torch.cat([e.crops.images[index].cpu(), template], dim=-1),
+        "inlier matches of the best template",
+    )
+    inliers = torch.nonzero(e.hypotheses.inliers[index, best].cpu()).flatten()
+    inliers = inliers[:: max(1, len(inliers) // _MOST_LINES)]
+    start = e.correspondences.points_image[index].cpu()[inliers]
+    end = e.correspondences.pixels_template[index, best].cpu()[inliers] + torch.tensor([float(size), 0.0])
+    lines = torch.stack([start, end], dim=1).numpy()
+    hues = torch.linspace(0, 1, max(len(lines), 1)).numpy()
+    axes.add_collection(LineCollection(list(lines), array=hues, cmap="hsv", linewidths=0.8))
+
+
+def _show(axes: Axes, image: Tensor, title: str) -> None:
+    axes.imshow(image.clamp(0, 1).permute(1, 2, 0).numpy())
+    axes.set_title(title, fontsize=9)
+    axes.set_axis_off()

@@ -1,0 +1,91 @@
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+
+from foundpose.bop import BopDataset
+from foundpose.config import build_method, claim_run_folder
+from foundpose.features import DenseSift, PatchExtractor
+
+CONF = Path(__file__).resolve().parents[1] / "conf"
+GROUPS = sorted(
+    (group.name, option.stem) for group in CONF.iterdir() if group.is_dir() for option in group.glob("*.yaml")
+)
+MODULES = {"renderer", "viewpoints", "words", "bow", "retrieval", "matcher", "pnp", "crop", "pictures"}
+
+
+def load(name="config", *overrides):
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return compose(name, overrides=list(overrides))
+
+
+@pytest.mark.parametrize(("group", "option"), GROUPS)
+def test_every_option_is_instantiated(group, option, tiny_bop, monkeypatch):
+    if group == "experiment":
+        cfg = load("config", f"experiment={option}")
+    else:
+        cfg = load("config", f"{group}={option}")
+    if group == "extractor" and option.startswith("dinov2") and option != "dinov2_random":
+        # The same model without its weights, small: the real weights are not here.
+        cfg.extractor.weights, cfg.extractor.layer = "random", 0
+        cfg.extractor.seed = 0
+        cfg.extractor.config = {"hidden_size": 24, "num_attention_heads": 2, "num_hidden_layers": 1}
+    if group == "data":
+        cfg.data.root, cfg.data.split, cfg.data.models = str(tiny_bop), "test", "models"
+    if group == "extractor":
+        assert isinstance(instantiate(cfg.extractor), PatchExtractor)
+        assert cfg.sigma > 0
+    elif group in MODULES:
+        assert instantiate(cfg[group]) is not None
+    elif group == "projection":
+        assert cfg.projection.num_components == 256
+    elif group == "data":
+        assert isinstance(instantiate(cfg.data), BopDataset)
+    elif group == "masks":
+        cfg.data.root = str(tiny_bop)
+        assert len(instantiate(cfg.masks)(BopDataset(tiny_bop))) == 3
+    elif group == "corruption":
+        assert instantiate(cfg.corruption)(DenseSift()).fingerprint() == DenseSift().fingerprint()
+    elif group == "experiment":
+        if option == "paper":
+            cfg.extractor = load("config", "extractor=dense_sift").extractor
+        assert build_method(cfg).pipeline.crop.size == 420
+    else:
+        pytest.fail(f"no test instantiates the group {group}")
+
+
+def test_defaults_are_the_papers():
+    cfg = load()
+    assert cfg == load("config", "experiment=paper")
+    assert (cfg.extractor.variant, cfg.extractor.layer, cfg.sigma) == ("vitl14_reg", 18, 10.0)
+    assert (cfg.crop.size, cfg.crop.fill, cfg.viewpoints.count) == (420, 0.6, 800)
+    assert (cfg.projection.num_components, cfg.words.num_words, cfg.bow.num_nearest) == (256, 2048, 3)
+    assert (cfg.retrieval.num_templates, cfg.pnp.iterations, cfg.pnp.threshold) == (5, 400, 10.0)
+    assert cfg.bow.sigma == 10.0
+    assert cfg.retrieval.bow == cfg.onboarder.bow
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in CONF.glob("*.yaml")))
+def test_every_app_builds_its_method(name, tmp_path):
+    cfg = load(name, "extractor=dense_sift", "words.num_words=32", f"representations={tmp_path}", "sigma=0.7")
+    method = build_method(cfg)
+    assert method.onboarder.bow.sigma == method.pipeline.retriever.bow.sigma == 0.7
+    assert method.onboarder.extractor is method.pipeline.extractor
+    assert method.onboarder.words.num_words == 32
+    assert method.onboarder.image_size == method.pipeline.crop.size
+
+
+def test_a_device_that_is_not_there(monkeypatch):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    with pytest.raises(ValueError, match="use device=cpu"):
+        build_method(load("config", "extractor=dense_sift", "device=cuda"))
+
+
+def test_a_run_folder_keeps_to_its_settings(tmp_path):
+    cfg = OmegaConf.create({"a": 1, "device": "cpu"})
+    claim_run_folder(tmp_path, cfg, ignore=("device",))
+    claim_run_folder(tmp_path, OmegaConf.create({"a": 1, "device": "cuda"}), ignore=("device",))
+    with pytest.raises(ValueError, match=r'(?s)other settings.*-  "a": 1.*\+  "a": 2'):
+        claim_run_folder(tmp_path, OmegaConf.create({"a": 2, "device": "cpu"}), ignore=("device",))

@@ -1,0 +1,174 @@
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from foundpose import FoundPose, PoseStatus
+from foundpose.features import CoordinateCode, PatchNoise
+from foundpose.geometry import PerspectiveCrop, intrinsics_matrix, make_transform, pixel_rays, rotation_angle
+from foundpose.matching import PatchMatcher
+from foundpose.pnp import RansacPnp
+from foundpose.rendering import CoordinateRenderer
+from foundpose.rendering.coordinates import render_coordinate_image
+from foundpose.retrieval import SoftAssignBow, TemplateRetriever
+from foundpose.synthetic import procedural_mesh
+
+SIZE = (480, 640)
+K = intrinsics_matrix(600.0, 605.0, 322.0, 236.0)
+
+
+def make_pipeline(extractor=None, **changes):
+    settings = {
+        "crop": PerspectiveCrop(),
+        "extractor": extractor or CoordinateCode(),
+        "retriever": TemplateRetriever(SoftAssignBow()),
+        "matcher": PatchMatcher(),
+        "pnp": RansacPnp(),
+    }
+    return FoundPose(**(settings | changes)).eval()
+
+
+def pose_at(mesh, pixel, distance, seed):
+    R = torch.from_numpy(Rotation.random(random_state=seed).as_matrix()).float()
+    t = pixel_rays(torch.tensor([pixel]), K)[0] * distance - R @ mesh.bounds.mean(0)
+    return make_transform(R, t)
+
+
+@pytest.fixture(scope="module")
+def scene(blob):
+    """Two blobs in one picture of coordinates and their masks."""
+    T = torch.stack([pose_at(blob, (180.0, 150.0), 700.0, 1), pose_at(blob, (430.0, 300.0), 900.0, 2)])
+    renderer = CoordinateRenderer()
+    image = render_coordinate_image(renderer, [blob, blob], list(T), K, SIZE)
+    masks = renderer(blob, T, K.expand(2, 3, 3), SIZE).mask
+    return image, masks, T
+
+
+def errors(estimates, T_true):
+    T = estimates.T_camera_from_model
+    angle = torch.rad2deg(rotation_angle(T[:, :3, :3], T_true[:, :3, :3]))
+    return angle, (T[:, :3, 3] - T_true[:, :3, 3]).norm(dim=1)
+
+
+def test_true_coordinates_give_the_true_pose(scene, oracle_blob, blob):
+    image, masks, T_true = scene
+    with torch.no_grad():
+        e = make_pipeline()(image[None], K[None], oracle_blob, masks=masks, image_index=torch.tensor([0, 0]))
+    assert e.valid.all()
+    assert (e.status == PoseStatus.OK).all()
+    angle, distance = errors(e, T_true)
+    assert angle.max() < 2.0
+    assert distance.max() < 0.05 * blob.diameter
+    assert (e.score > 0.7).all()
+    assert torch.allclose(e.score, e.num_inliers / e.query.valid.sum(1))
+    # The chosen hypothesis has the most inliers, and its pose is the one returned.
+    assert torch.equal(e.num_inliers, e.hypotheses.num_inliers.amax(1))
+    assert (e.templates.similarity.diff(dim=1) <= 0).all()
+    row = torch.arange(2)
+    T_crop = e.hypotheses.T_crop_from_model[row, e.best]
+    assert torch.allclose(e.crops.T_crop_from_camera @ e.T_camera_from_model, T_crop, atol=1e-3)
+
+
+def test_noise_on_a_third_of_the_patches(scene, oracle_blob):
+    image, masks, T_true = scene
+    pipeline = make_pipeline(PatchNoise(CoordinateCode(), 0.3))
+    with torch.no_grad():
+        e = pipeline(image[None], K[None], oracle_blob, masks=masks, image_index=torch.tensor([0, 0]))
+    assert errors(e, T_true)[0].max() < 3.0
+    assert (e.score > 0.45).all()
+
+
+def test_alone_as_in_a_batch_with_other_objects(scene, oracle_blob, oracle_onboarder):
+    image, masks, T_true = scene
+    other_mesh = procedural_mesh(8, subdivisions=5)
+    other = oracle_onboarder(other_mesh, "other")
+    T_other = pose_at(other_mesh, (300.0, 220.0), 600.0, 5)[None]
+    renderer = CoordinateRenderer()
+    images = torch.stack([image, render_coordinate_image(renderer, [other_mesh], list(T_other), K, SIZE)])
+    empty = torch.zeros(1, *SIZE, dtype=torch.bool)
+    all_masks = torch.cat([renderer(other_mesh, T_other, K[None], SIZE).mask, masks[:1], empty, masks[1:]])
+    pipeline = make_pipeline()
+    with torch.no_grad():
+        batch = pipeline(
+            images,
+            K.expand(2, 3, 3),
+            [oracle_blob, other],
+            masks=all_masks,
+            image_index=torch.tensor([1, 0, 0, 0]),
+            object_index=torch.tensor([1, 0, 0, 0]),
+        )
+        alone = [
+            pipeline(images[i][None], K[None], r, masks=all_masks[b : b + 1])
+            for b, (i, r) in enumerate(((1, other), (0, oracle_blob), (0, oracle_blob), (0, oracle_blob)))
+        ]
+    assert batch.valid.tolist() == [True, True, False, True]
+    assert batch.status[2] == PoseStatus.UNUSABLE_MASK
+    assert torch.isfinite(batch.T_camera_from_model).all()
+    for b in (0, 1, 3):
+        assert torch.equal(batch.templates.index[b], alone[b].templates.index[0])
+        assert batch.num_inliers[b] == alone[b].num_inliers[0]
+        assert torch.allclose(batch.T_camera_from_model[b], alone[b].T_camera_from_model[0], atol=0.02)
+    assert not alone[2].valid[0]
+    angle, _ = errors(batch, torch.cat([T_other, T_true[:1], T_true[:1], T_true[1:]]))
+    assert angle[[0, 1, 3]].max() < 2.0
+
+
+def test_boxes_in_place_of_masks(scene, oracle_blob):
+    image, masks, T_true = scene
+    rows, columns = torch.nonzero(masks[0], as_tuple=True)
+    box = torch.tensor([[columns.min() - 0.5, rows.min() - 0.5, columns.max() + 0.5, rows.max() + 0.5]])
+    with torch.no_grad():
+        e = make_pipeline()(image[None], K[None], oracle_blob, boxes=box)
+    assert errors(e, T_true[:1])[0] < 3.0
+
+
+def test_mask_without_patches_and_mask_of_background(scene, oracle_blob):
+    image, _, _ = scene
+    masks = torch.zeros(2, *SIZE, dtype=torch.bool)
+    # A ring so thin that no patch centre is inside it.
+    masks[0, 100, 100:400] = True
+    masks[1, 400:470, 10:90] = True
+    with torch.no_grad():
+        e = make_pipeline()(image[None], K[None], oracle_blob, masks=masks, image_index=torch.tensor([0, 0]))
+    assert torch.isfinite(e.T_camera_from_model).all()
+    assert e.status[0] in (
+        PoseStatus.NO_PATCHES,
+        PoseStatus.TOO_FEW_CORRESPONDENCES,
+        PoseStatus.TOO_FEW_INLIERS,
+    )
+    # Noise may fit a few patches, but never many.
+    assert e.score[1] < 0.2
+
+
+def test_gradients_reach_image_and_descriptors(scene, oracle_blob):
+    image, masks, _ = scene
+    picture = image[None].clone().requires_grad_()
+    e = make_pipeline()(picture, K[None], oracle_blob, masks=masks[:1])
+    finite = e.correspondences.distance[e.correspondences.valid]
+    (finite.mean() + e.templates.similarity.sum()).backward()
+    assert torch.isfinite(picture.grad).all()
+    assert picture.grad.abs().sum() > 0
+
+
+def test_bad_input(scene, oracle_blob):
+    image, masks, _ = scene
+    pipeline = make_pipeline()
+    index = torch.tensor([0, 0])
+    with pytest.raises(ValueError, match="another extractor"):
+        make_pipeline(CoordinateCode(seed=1))(image[None], K[None], oracle_blob, masks=masks[:1])
+    with pytest.raises(ValueError, match="templates of 'blob' are 420 px wide, the crops 280 px"):
+        make_pipeline(crop=PerspectiveCrop(280))(image[None], K[None], oracle_blob, masks=masks[:1])
+    with pytest.raises(ValueError, match="object_index .* is needed to tell 2 objects apart"):
+        pipeline(image[None], K[None], [oracle_blob] * 2, masks=masks, image_index=index)
+    with pytest.raises(ValueError, match=r"object_index must lie in \[0, 1\), got \[0, 1\]"):
+        pipeline(
+            image[None],
+            K[None],
+            [oracle_blob],
+            masks=masks,
+            image_index=index,
+            object_index=torch.tensor([0, 1]),
+        )
+    with pytest.raises(ValueError, match="objects is empty"):
+        pipeline(image[None], K[None], [], masks=masks[:1])
+    with pytest.raises(ValueError, match="nothing to estimate"):
+        pipeline(image[None], K[None], oracle_blob, masks=masks[:0], image_index=index[:0])
