@@ -17,8 +17,8 @@ from foundpose.progress import ProgressBars
 from foundpose.synthetic import cluttered_scene, procedural_mesh
 from foundpose.visualization import save_estimate_figure
 
-# A right pose lies within these of the truth.
-MAX_ROTATION_DEGREES = 5.0
+# A right pose lies within these of the truth: about half a template's distance from its neighbours, coarse as it is.
+MAX_ROTATION_DEGREES = 10.0
 MAX_TRANSLATION_DIAMETERS = 0.1
 
 

@@ -1,3 +1,38 @@
 """6D pose of unseen objects from one RGB image: FoundPose (ECCV 2024) as differentiable, batched modules."""
 
+from foundpose.features import DenseSift, DinoV2, FeatureHook, PatchExtractor, PcaProjection
+from foundpose.geometry import PerspectiveCrop, SphereInplane, SuperFibonacci
+from foundpose.matching import PatchMatcher
+from foundpose.onboarding import ObjectRepresentation, Onboarder, RepresentationStore
+from foundpose.pipeline import FoundPose, PoseEstimates, PoseStatus
+from foundpose.pnp import RansacPnp
+from foundpose.rendering import Mesh, PyrenderRenderer, RaycastRenderer, load_mesh
+from foundpose.retrieval import SoftAssignBow, TemplateRetriever, VisualWords
+
 __version__ = "0.1.0"
+
+__all__ = [
+    "DenseSift",
+    "DinoV2",
+    "FeatureHook",
+    "FoundPose",
+    "Mesh",
+    "ObjectRepresentation",
+    "Onboarder",
+    "PatchExtractor",
+    "PatchMatcher",
+    "PcaProjection",
+    "PerspectiveCrop",
+    "PoseEstimates",
+    "PoseStatus",
+    "PyrenderRenderer",
+    "RansacPnp",
+    "RaycastRenderer",
+    "RepresentationStore",
+    "SoftAssignBow",
+    "SphereInplane",
+    "SuperFibonacci",
+    "TemplateRetriever",
+    "VisualWords",
+    "load_mesh",
+]

@@ -43,7 +43,7 @@ def build_method(cfg: DictConfig) -> Method:
     if device.type == "cuda" and not torch.cuda.is_available():
         raise ValueError("device is 'cuda' but this PyTorch sees no GPU; use device=cpu")
     extractor: PatchExtractor = instantiate(cfg.extractor).to(device).eval()
-    query_extractor = extractor if cfg.corruption is None else instantiate(cfg.corruption)(extractor)
+    query_extractor = extractor if cfg.get("corruption") is None else instantiate(cfg.corruption)(extractor)
     onboarder: Onboarder = instantiate(cfg.onboarder, extractor=extractor)
     pipeline: FoundPose = instantiate(cfg.pipeline, extractor=query_extractor)
     return Method(

@@ -5,6 +5,14 @@ import numpy as np
 import pytest
 import torch
 
+from foundpose.features import CoordinateCode
+from foundpose.geometry import SuperFibonacci
+from foundpose.onboarding import ObjectRepresentation, Onboarder
+from foundpose.rendering import CoordinateRenderer, Mesh
+from foundpose.retrieval import SoftAssignBow, VisualWords
+from foundpose.synthetic import procedural_mesh
+from tests.bop_dataset import make_bop_dataset
+
 
 @pytest.fixture(scope="session")
 def lmo_root() -> Path:
@@ -26,9 +34,32 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(0)
 
 
-def random_rotations(count: int, seed: int = 0) -> torch.Tensor:
-    """Uniformly random rotations (count, 3, 3), float64."""
-    q = torch.randn(count, 4, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-    from kornia.geometry.conversions import quaternion_to_rotation_matrix
+@pytest.fixture(scope="session")
+def tiny_bop(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A BOP dataset of two procedural objects and three pictures."""
+    return make_bop_dataset(tmp_path_factory.mktemp("bop") / "tiny")
 
-    return quaternion_to_rotation_matrix(q)
+
+@pytest.fixture(scope="session")
+def blob() -> Mesh:
+    """A procedural mesh of 10 k vertices."""
+    return procedural_mesh(3, subdivisions=5)
+
+
+@pytest.fixture(scope="session")
+def oracle_onboarder() -> Onboarder:
+    """Onboards with codes of true coordinates, 150 templates and 200 words."""
+    return Onboarder(
+        CoordinateRenderer(),
+        CoordinateCode(),
+        SuperFibonacci(150),
+        VisualWords(200),
+        SoftAssignBow(),
+        num_components=64,
+    )
+
+
+@pytest.fixture(scope="session")
+def oracle_blob(blob: Mesh, oracle_onboarder: Onboarder) -> ObjectRepresentation:
+    """Representation of the blob under the oracle."""
+    return oracle_onboarder(blob, "blob")

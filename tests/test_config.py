@@ -23,15 +23,12 @@ def load(name="config", *overrides):
 
 @pytest.mark.parametrize(("group", "option"), GROUPS)
 def test_every_option_is_instantiated(group, option, tiny_bop, monkeypatch):
-    if group == "experiment":
-        cfg = load("config", f"experiment={option}")
-    else:
-        cfg = load("config", f"{group}={option}")
+    overrides = [f"{group}={option}"]
     if group == "extractor" and option.startswith("dinov2") and option != "dinov2_random":
         # The same model without its weights, small: the real weights are not here.
-        cfg.extractor.weights, cfg.extractor.layer = "random", 0
-        cfg.extractor.seed = 0
-        cfg.extractor.config = {"hidden_size": 24, "num_attention_heads": 2, "num_hidden_layers": 1}
+        small = "{hidden_size: 24, num_attention_heads: 2, num_hidden_layers: 1}"
+        overrides += ["extractor.weights=random", "extractor.seed=0", "extractor.layer=0", f"extractor.config={small}"]
+    cfg = load("config", *overrides)
     if group == "data":
         cfg.data.root, cfg.data.split, cfg.data.models = str(tiny_bop), "test", "models"
     if group == "extractor":
@@ -49,8 +46,8 @@ def test_every_option_is_instantiated(group, option, tiny_bop, monkeypatch):
     elif group == "corruption":
         assert instantiate(cfg.corruption)(DenseSift()).fingerprint() == DenseSift().fingerprint()
     elif group == "experiment":
-        if option == "paper":
-            cfg.extractor = load("config", "extractor=dense_sift").extractor
+        if cfg.extractor._target_.endswith("DinoV2"):
+            cfg = load("config", *overrides, "extractor=dense_sift")
         assert build_method(cfg).pipeline.crop.size == 420
     else:
         pytest.fail(f"no test instantiates the group {group}")

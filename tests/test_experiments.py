@@ -20,7 +20,7 @@ from tests.bop_dataset import write_ply
 
 ROOT = Path(__file__).resolve().parents[1]
 # Small, but everything is in it.
-SMALL = ["viewpoints.count=100", "words.num_words=128", "projection.num_components=64"]
+SMALL = ["viewpoints.count=60", "words.num_words=128", "projection.num_components=64"]
 
 
 def run_app(monkeypatch, name, *overrides):
@@ -47,8 +47,7 @@ def own_picture(tmp_path_factory):
         f"intrinsics=[{K[0, 0]},{K[1, 1]},{K[0, 2]},{K[1, 2]}]",
         "extractor=dense_sift",
         "viewpoints.count=200",
-        "words.num_words=256",
-        "projection.num_components=64",
+        "words.num_words=1024",
         f"representations={folder / 'representations'}",
     ]
     return folder, scene, mesh, arguments
@@ -218,7 +217,7 @@ def test_onboard_skips_what_is_there(tiny_bop, monkeypatch, tmp_path, capsys):
         f"hydra.run.dir={tmp_path / 'log'}",
     ]
     run_app(monkeypatch, "onboard", *arguments, f"data.root={tiny_bop}", "objects=[2]")
-    assert "tiny-000002: onboarded, 100 templates" in capsys.readouterr().out
+    assert "tiny-000002: onboarded, 60 templates" in capsys.readouterr().out
     run_app(monkeypatch, "onboard", *arguments, f"data.root={tiny_bop}")
     out = capsys.readouterr().out
     assert "tiny-000001: onboarded" in out

@@ -40,13 +40,14 @@ def describe_folder(folder: Path, most: int = 12) -> str:
     return f"{folder} holds {', '.join(names[:most])}{more}"
 
 
-def read_image(path: Path) -> Tensor:
+def read_image(path: str | Path) -> Tensor:
     """Read a picture as (3, H, W) float32 RGB in [0, 1]; grey becomes RGB, alpha is dropped, 16 bit is scaled.
 
     Raises:
         FileNotFoundError: no such file.
         BopError: not a picture.
     """
+    path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"no image at {path}; {describe_folder(path.parent)}")
     try:
@@ -65,7 +66,7 @@ def read_image(path: Path) -> Tensor:
     return pixels[..., :3].permute(2, 0, 1).contiguous()
 
 
-def read_mask(path: Path, size: tuple[int, int] | None = None) -> Tensor:
+def read_mask(path: str | Path, size: tuple[int, int] | None = None) -> Tensor:
     """Read a mask as (H, W) bool: True where any channel is above half of the range.
 
     Args:

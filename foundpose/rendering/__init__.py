@@ -2,11 +2,13 @@
 
 from foundpose.rendering.base import Renderer, RenderOutput
 from foundpose.rendering.coordinates import CoordinateRenderer
+from foundpose.rendering.coordinates import CoordinateRenderer, render_coordinate_image
 from foundpose.rendering.gl import PyrenderRenderer
 from foundpose.rendering.mesh import Mesh, MeshError, load_mesh, warn_if_scale_implausible
 from foundpose.rendering.raycast import RaycastRenderer
 
 __all__ = [
+    "CoordinateRenderer",
     "CoordinateRenderer",
     "Mesh",
     "MeshError",
@@ -15,5 +17,6 @@ __all__ = [
     "RenderOutput",
     "Renderer",
     "load_mesh",
+    "render_coordinate_image",
     "warn_if_scale_implausible",
 ]

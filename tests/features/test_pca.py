@@ -1,4 +1,5 @@
 import io
+import itertools
 
 import pytest
 import torch
@@ -58,7 +59,7 @@ def test_accumulator_does_not_depend_on_batching(cuts: list[int], offset: float)
     x = samples(200, 7, offset=offset)
     bounds = [0, *sorted(cuts), 200]
     streamed, merged = CovarianceAccumulator(7), CovarianceAccumulator(7)
-    for start, stop in zip(bounds, bounds[1:], strict=False):
+    for start, stop in itertools.pairwise(bounds):
         streamed.update(x[start:stop])
         merged.merge(CovarianceAccumulator(7).update(x[start:stop]))
     expected = torch.cov(x.T)

@@ -40,7 +40,7 @@ def brute_force(inputs: Problem, cyclic: bool, top_k: int | None) -> Matches:
             back = D.argmin(0)[forth]
             cycle = np.linalg.norm(pixels[b, rows] - pixels[b, rows[back]], axis=-1) * cyclic
             best = D[np.arange(len(rows)), forth]
-            kept = sorted(range(len(rows)), key=lambda i: (cycle[i], best[i], i))[:top_k]  # noqa: B023
+            kept = sorted(range(len(rows)), key=lambda i: (cycle[i], best[i], i))[:top_k]
             index[b, t, rows[kept]] = columns[forth[kept]]
             distance[b, t, rows[kept]] = best[kept]
     return Matches(

@@ -1,0 +1,48 @@
+import re
+from pathlib import Path
+
+import torch
+from PIL import Image
+
+from foundpose.geometry import rotation_angle
+from foundpose.synthetic import cluttered_scene, procedural_mesh
+from tests.bop_dataset import write_ply
+
+README = (Path(__file__).resolve().parents[1] / "README.md").read_text()
+
+
+def test_the_python_example_runs(tmp_path, monkeypatch, capsys):
+    (code,) = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+    statements = [line for line in code.splitlines() if line and not line.startswith(("import", "from"))]
+    assert len(statements) <= 10
+    mesh = procedural_mesh(5, subdivisions=5)
+    scene = cluttered_scene(mesh, seed=5)
+    write_ply(tmp_path / "cup.ply", mesh)
+    Image.fromarray((scene.image * 255).round().byte().permute(1, 2, 0).numpy()).save(tmp_path / "photo.png")
+    Image.fromarray(scene.mask.numpy()).save(tmp_path / "mask.png")
+    # Fewer templates and words, and this picture's camera; all else as it stands there.
+    K = scene.K
+    for old, new in {
+        "SuperFibonacci(800)": "SuperFibonacci(200)",
+        "VisualWords(2048)": "VisualWords(1024)",
+        "(600, 600, 319.5, 239.5)": f"({K[0, 0]}, {K[1, 1]}, {K[0, 2]}, {K[1, 2]})",
+    }.items():
+        assert old in code
+        code = code.replace(old, new)
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {}
+    exec(compile(code, "README.md", "exec"), names)
+    poses = names["poses"]
+    assert poses.valid[0]
+    R = scene.T_camera_from_model[:3, :3]
+    assert torch.rad2deg(rotation_angle(poses.T_camera_from_model[0, :3, :3], R)) < 10
+    assert "tensor" in capsys.readouterr().out
+
+
+def test_every_option_of_the_configuration_is_listed():
+    conf = Path(__file__).resolve().parents[1] / "conf"
+    for group in (path for path in conf.iterdir() if path.is_dir()):
+        assert f"`{group.name}`" in README, group.name
+        for option in group.glob("*.yaml"):
+            name = re.sub(r"dinov2_vit[sblg]14(_reg)?", "dinov2_vit{s,b,l,g}14", option.stem)
+            assert f"`{name}`" in README, f"{group.name}={option.stem}"
