@@ -222,7 +222,7 @@ def save_overlays(
         )
 
 
-def write_json(path: Path, content: Any) -> None:  # noqa: ANN401 - JSON
+def write_json(path: Path, content: Any) -> None:
     """Write JSON atomically."""
     write_atomically(path, lambda temporary: temporary.write_text(json.dumps(content, indent=1)))
 

@@ -1,8 +1,8 @@
 """The composed method: from images and masks to coarse poses."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar, cast
 
 import torch
 import torch.nn.functional as F
@@ -14,6 +14,8 @@ from foundpose.matching import PatchMatcher
 from foundpose.onboarding import ObjectRepresentation
 from foundpose.pnp import PnpStatus, RansacPnp
 from foundpose.retrieval import QueryPatches, RetrievedTemplates, TemplateRetriever
+
+_Fields = TypeVar("_Fields", bound=tuple[Any, ...])
 
 
 class PoseStatus(IntEnum):
@@ -181,7 +183,8 @@ class FoundPose(nn.Module):
         for representation, crop_index in zip(objects, members, strict=True):
             if len(crop_index) == 0:
                 continue
-            query = QueryPatches(*(None if part is None else part[crop_index] for part in raw))
+            rows = crop_index.to(raw.valid.device)
+            query = _combine([raw], lambda fields: fields[0][rows])  # noqa: B023 - called at once
             descriptors = query.descriptors.to(representation.projection.components.dtype)
             query = query._replace(descriptors=representation.projection(descriptors))
             templates = self.retriever(query, representation)
@@ -210,12 +213,12 @@ class FoundPose(nn.Module):
             )
         # Back to the order of the batch.
         order = torch.cat(members).argsort()
+
+        def join(fields: list[Tensor]) -> Tensor:
+            return torch.cat(fields)[order.to(fields[0].device)]
+
         queries, retrieved, matched = zip(*parts, strict=True)
-        return (
-            QueryPatches(*_join(queries, order)),
-            RetrievedTemplates(*_join(retrieved, order)),
-            Correspondences(*_join(matched, order)),
-        )
+        return _combine(queries, join), _combine(retrieved, join), _combine(matched, join)
 
     def _solve(self, correspondences: Correspondences, K_crop: Tensor) -> PoseHypotheses:
         """PnP for all crops and templates as one batch."""
@@ -318,10 +321,11 @@ def _members(object_index: Tensor | None, count: int, num_objects: int) -> list[
     return [torch.nonzero(labels == i).flatten() for i in range(num_objects)]
 
 
-def _join(parts: Sequence[Sequence[Tensor | None]], order: Tensor) -> list[Tensor | None]:
-    """Concatenate tuples of tensors field by field and put the rows in order."""
-    joined: list[Tensor | None] = []
-    for field in zip(*parts, strict=True):
-        tensors = [tensor for tensor in field if tensor is not None]
-        joined.append(torch.cat(tensors)[order.to(tensors[0].device)] if tensors else None)
-    return joined
+def _combine(parts: Sequence[_Fields], combine: Callable[[list[Tensor]], Tensor]) -> _Fields:
+    """Combine named tuples of tensors field by field; a field that is None stays None."""
+    fields = [
+        None if any(tensor is None for tensor in field) else combine(list(field))
+        for field in zip(*parts, strict=True)
+    ]
+    make = cast(Callable[..., _Fields], type(parts[0]))
+    return make(*fields)

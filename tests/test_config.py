@@ -27,7 +27,12 @@ def test_every_option_is_instantiated(group, option, tiny_bop, monkeypatch):
     if group == "extractor" and option.startswith("dinov2") and option != "dinov2_random":
         # The same model without its weights, small: the real weights are not here.
         small = "{hidden_size: 24, num_attention_heads: 2, num_hidden_layers: 1}"
-        overrides += ["extractor.weights=random", "extractor.seed=0", "extractor.layer=0", f"extractor.config={small}"]
+        overrides += [
+            "extractor.weights=random",
+            "extractor.seed=0",
+            "extractor.layer=0",
+            f"extractor.config={small}",
+        ]
     cfg = load("config", *overrides)
     if group == "data":
         cfg.data.root, cfg.data.split, cfg.data.models = str(tiny_bop), "test", "models"

@@ -3,14 +3,22 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from foundpose import FoundPose, PoseStatus
-from foundpose.features import CoordinateCode, PatchNoise
-from foundpose.geometry import PerspectiveCrop, intrinsics_matrix, make_transform, pixel_rays, rotation_angle
+from foundpose.features import CoordinateCode, DinoV2, PatchNoise
+from foundpose.geometry import (
+    PerspectiveCrop,
+    SuperFibonacci,
+    intrinsics_matrix,
+    make_transform,
+    pixel_rays,
+    rotation_angle,
+)
 from foundpose.matching import PatchMatcher
+from foundpose.onboarding import Onboarder
 from foundpose.pnp import RansacPnp
-from foundpose.rendering import CoordinateRenderer
+from foundpose.rendering import CoordinateRenderer, RaycastRenderer
 from foundpose.rendering.coordinates import render_coordinate_image
-from foundpose.retrieval import SoftAssignBow, TemplateRetriever
-from foundpose.synthetic import procedural_mesh
+from foundpose.retrieval import SoftAssignBow, TemplateRetriever, VisualWords
+from foundpose.synthetic import cluttered_scene, procedural_mesh
 
 SIZE = (480, 640)
 K = intrinsics_matrix(600.0, 605.0, 322.0, 236.0)
@@ -157,7 +165,7 @@ def test_bad_input(scene, oracle_blob):
         make_pipeline(CoordinateCode(seed=1))(image[None], K[None], oracle_blob, masks=masks[:1])
     with pytest.raises(ValueError, match="templates of 'blob' are 420 px wide, the crops 280 px"):
         make_pipeline(crop=PerspectiveCrop(280))(image[None], K[None], oracle_blob, masks=masks[:1])
-    with pytest.raises(ValueError, match="object_index .* is needed to tell 2 objects apart"):
+    with pytest.raises(ValueError, match=r"object_index \(B,\) is needed to tell 2 objects apart"):
         pipeline(image[None], K[None], [oracle_blob] * 2, masks=masks, image_index=index)
     with pytest.raises(ValueError, match=r"object_index must lie in \[0, 1\), got \[0, 1\]"):
         pipeline(
@@ -172,3 +180,25 @@ def test_bad_input(scene, oracle_blob):
         pipeline(image[None], K[None], [], masks=masks[:1])
     with pytest.raises(ValueError, match="nothing to estimate"):
         pipeline(image[None], K[None], oracle_blob, masks=masks[:0], image_index=index[:0])
+
+
+def test_a_vision_transformer_takes_the_place_of_the_oracle(blob):
+    """The whole path with DINOv2's architecture (small, random weights): it runs, and gradients reach the weights."""
+    size = {"hidden_size": 48, "num_attention_heads": 3, "num_hidden_layers": 2}
+    extractor = DinoV2.random_init("vits14_reg", layer=1, seed=0, config=size)
+    bow = SoftAssignBow(sigma=1.0)
+    onboarder = Onboarder(
+        RaycastRenderer(), extractor, SuperFibonacci(20), VisualWords(50), bow, num_components=32
+    )
+    representation = onboarder(blob, "blob")
+    assert representation.template_cls.shape == (20, 48)
+    picture = cluttered_scene(blob, seed=3)
+    pipeline = make_pipeline(extractor, retriever=TemplateRetriever(bow, num_templates=3))
+    e = pipeline(picture.image[None], picture.K[None], representation, masks=picture.mask[None])
+    assert e.hypotheses.T_crop_from_model.shape == (1, 3, 4, 4)
+    assert torch.isfinite(e.T_camera_from_model).all()
+    assert e.query.cls.shape == (1, 48)
+    (e.correspondences.distance[e.correspondences.valid].mean() - e.templates.similarity.sum()).backward()
+    gradients = [p.grad for p in extractor.parameters() if p.grad is not None]
+    assert sum(g.abs().sum() for g in gradients) > 0
+    assert all(torch.isfinite(g).all() for g in gradients)

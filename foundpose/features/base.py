@@ -1,5 +1,6 @@
 """What every patch extractor provides."""
 
+import math
 from abc import ABC, abstractmethod
 from typing import NamedTuple
 
@@ -46,8 +47,8 @@ class PatchExtractor(nn.Module, ABC):
         """Settings that change the descriptors; an object representation is valid for one fingerprint only."""
 
     def grid_size(self, image_size: int) -> int:
-        """Number of patches along one side of an image of ``image_size`` pixels."""
-        return int((image_size - 1 - 2 * self.offset) / self.stride + 1e-6) + 1
+        """Number of patches along one side of an image of ``image_size`` pixels; 0 where not one fits."""
+        return max(0, math.floor((image_size - 1 - 2 * self.offset) / self.stride + 1e-6) + 1)
 
     def patch_centers(self, image_size: int, device: torch.device, dtype: torch.dtype) -> Tensor:
         """Pixel coordinates (h, w, 2) of the patch centres as ``(u, v)``."""

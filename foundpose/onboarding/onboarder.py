@@ -132,9 +132,10 @@ class Onboarder(nn.Module):
         descriptors = torch.cat(projected)
         report("PCA", 1, 1)
 
-        report("visual words", 0, 1)
-        words = self.words(descriptors)
-        report("visual words", 1, 1)
+        most = self.words.num_iterations
+        report("visual words", 0, most)
+        words = self.words(descriptors, lambda done, _: report("visual words", min(done, most - 1), most))
+        report("visual words", most, most)
 
         counts = torch.cat(raw.counts)
         grid = self.extractor.grid_size(self.image_size)

@@ -202,7 +202,20 @@ class ObjectRepresentation(nn.Module):
         info = read_info(path)
         with safe_open(str(path), framework="pt", device=str(device)) as file:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
-        representation = cls(info=info, **_constructor_tensors(tensors, path))
+        representation = cls(
+            projection=_load_projection(tensors, path),
+            words=_take(tensors, "words", path),
+            idf=_take(tensors, "idf", path),
+            template_bow=_take(tensors, "template_bow", path),
+            descriptors=_take(tensors, "descriptors", path),
+            points_model=_take(tensors, "points_model", path),
+            patch_index=_take(tensors, "patch_index", path),
+            template_offsets=_take(tensors, "template_offsets", path),
+            T_template_from_model=_take(tensors, "T_template_from_model", path),
+            K_template=_take(tensors, "K_template", path),
+            template_cls=tensors.get("template_cls"),
+            info=info,
+        )
         if extractor is not None:
             representation.check_extractor(extractor)
         return representation
@@ -236,22 +249,19 @@ def read_info(path: str | Path) -> RepresentationInfo:
     return RepresentationInfo(**facts)
 
 
-def _constructor_tensors(
-    tensors: Mapping[str, Tensor], path: Path
-) -> dict[str, Tensor | PcaProjection | None]:
-    """Sort a file's tensors into constructor arguments."""
-    projection_state = {
-        name.removeprefix("projection."): t for name, t in tensors.items() if name.startswith("projection.")
-    }
-    names = [name for name in ObjectRepresentation.__annotations__ if name != "template_cls"]
-    missing = [name for name in names if name not in tensors]
-    if missing or "components" not in projection_state:
-        raise ValueError(f"{path} lacks the tensors {missing or ['projection.components']}; onboard again")
-    projection = PcaProjection(len(projection_state["components"]))
-    projection.load_state_dict(projection_state)
-    projection.to(projection_state["components"])
-    return {
-        "projection": projection,
-        "template_cls": tensors.get("template_cls"),
-        **{name: tensors[name] for name in names},
-    }
+def _take(tensors: Mapping[str, Tensor], name: str, path: Path) -> Tensor:
+    """A tensor of the file."""
+    if name not in tensors:
+        raise ValueError(f"{path} lacks the tensor {name!r}; onboard the object again")
+    return tensors[name]
+
+
+def _load_projection(tensors: Mapping[str, Tensor], path: Path) -> PcaProjection:
+    """The PCA that is stored in the file."""
+    prefix = "projection."
+    components = _take(tensors, f"{prefix}components", path)
+    projection = PcaProjection(len(components)).to(components)
+    projection.load_state_dict(
+        {name.removeprefix(prefix): t for name, t in tensors.items() if name.startswith(prefix)}
+    )
+    return projection

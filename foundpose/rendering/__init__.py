@@ -1,14 +1,12 @@
 """Mesh loading and renderers behind one interface."""
 
 from foundpose.rendering.base import Renderer, RenderOutput
-from foundpose.rendering.coordinates import CoordinateRenderer
 from foundpose.rendering.coordinates import CoordinateRenderer, render_coordinate_image
 from foundpose.rendering.gl import PyrenderRenderer
 from foundpose.rendering.mesh import Mesh, MeshError, load_mesh, warn_if_scale_implausible
 from foundpose.rendering.raycast import RaycastRenderer
 
 __all__ = [
-    "CoordinateRenderer",
     "CoordinateRenderer",
     "Mesh",
     "MeshError",

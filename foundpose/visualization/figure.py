@@ -73,7 +73,8 @@ def save_estimate_figure(
     status = PoseStatus(int(e.status[index]))
 
     figure = Figure(figsize=(14, 11), layout="constrained")
-    top, middle, bottom = figure.subfigures(3, 1, height_ratios=[5, 2.6, 5])
+    grid = figure.add_gridspec(3, 1, height_ratios=[5, 2.6, 5])
+    top, middle, bottom = (figure.add_subfigure(grid[row, 0]) for row in range(3))
     left, right = top.subplots(1, 2, width_ratios=[image.shape[2] / image.shape[1], 1])
     drawn = image
     if bool(e.valid[index]):

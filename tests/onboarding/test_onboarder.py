@@ -85,6 +85,10 @@ def test_progress_tells_every_stage(blob):
     stages = list(dict.fromkeys(stage for stage, _, _ in calls))
     assert stages == ["templates", "PCA", "visual words", "bags of words"]
     assert ("templates", 12, 12) in calls
+    for stage in stages:
+        done = [call[1] for call in calls if call[0] == stage]
+        assert done == sorted(done)
+        assert done[-1] == next(call[2] for call in calls if call[0] == stage)
 
 
 def test_other_viewpoints_and_extractor(blob):
