@@ -4,6 +4,7 @@ python experiments/onboard.py mesh=cup.ply
 python experiments/onboard.py data=lmo data.root=/path/to/lmo objects=[1,5]
 """
 
+import time
 from pathlib import Path
 
 import hydra
@@ -14,6 +15,7 @@ from foundpose.bop import BopDataset
 from foundpose.config import Method, build_method, clear_errors
 from foundpose.progress import ProgressBars
 from foundpose.rendering import load_mesh
+from foundpose.timing import StageTimer
 
 
 def meshes_to_onboard(cfg: DictConfig) -> dict[str, Path]:
@@ -40,12 +42,19 @@ def main(cfg: DictConfig) -> None:
 def onboard(method: Method, name: str, file: Path) -> None:
     """Onboard one mesh unless that has been done."""
     mesh = load_mesh(file)
+    onboarder = method.onboarder
     known = method.store.has(mesh, name)
-    representation = method.store.get(mesh, name, ProgressBars(name))
+    parts = {"rendering": onboarder.renderer, "extractor": onboarder.extractor, "words": onboarder.words}
+    start = time.perf_counter()
+    with StageTimer(parts) as timer:
+        representation = method.store.get(mesh, name, ProgressBars(name))
+    total = time.perf_counter() - start
     size = representation.memory_bytes()["total"] / 2**20
+    spent = ", ".join(f"{part} {timer.seconds[part]:.1f} s" for part in parts)
     print(
-        f"{name}: {'already there' if known else 'onboarded'}, {representation.num_templates} templates, "
-        f"{len(representation.descriptors)} patches, {size:.0f} MiB, {method.store.path(mesh, name)}"
+        f"{name}: {'already there' if known else f'onboarded in {total:.1f} s ({spent})'}, "
+        f"{representation.num_templates} templates, {len(representation.descriptors)} patches, "
+        f"{size:.0f} MiB, {method.store.path(mesh, name)}"
     )
 
 

@@ -13,19 +13,15 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
+
+from foundpose.retrieval.assignment import cluster_means, find_nearest, has_fast_bfloat16
 
 Progress = Callable[[int, float], None]
 
 _RELAXATION = 1.8
 # The final iterations: exact products, no over-relaxation.
 _EXACT_ITERATIONS = 2
-# Scores of a block of points against all centroids; on a CPU they stay in the cache.
-_CPU_SCORES_PER_BLOCK = 1 << 21
-_GPU_SCORES_PER_BLOCK = 1 << 26
-# The search for the smallest of k scores first takes minima of groups, which is vectorised, unlike argmin.
-_GROUP = 64
 _ROWS_PER_BLOCK = 8192
 # The initial centroids are drawn in this many batches, from this many points per cluster.
 _INITIAL_BATCHES = 16
@@ -50,75 +46,6 @@ class KMeansResult(NamedTuple):
     assignment: Tensor
     inertia: Tensor
     num_iterations: int
-
-
-def has_fast_bfloat16(device: torch.device) -> bool:
-    """Whether a CPU multiplies bfloat16 matrices in hardware (GPUs are fast enough without)."""
-    return (
-        device.type == "cpu"
-        and torch.backends.mkldnn.is_available()
-        and torch.cpu._is_avx512_bf16_supported()
-    )
-
-
-def find_nearest(
-    points: Tensor, squared_norms: Tensor, centroids: Tensor, with_second: bool = False
-) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Nearest centroid of each point; the memory is that of one block of scores.
-
-    Args:
-        points: (N, d), floating point; bfloat16 points make the products in bfloat16.
-        squared_norms: (N,) squared norms of the points, in the dtype of ``centroids``.
-        centroids: (k, d).
-        with_second: whether to tell the distance to the second nearest centroid, too.
-
-    Returns:
-        Index (N,), squared distance (N,) and squared distance to the second nearest (N,) or None (inf if k = 1).
-        Of equally near centroids the first.
-    """
-    k = centroids.shape[0]
-    norms = centroids.square().sum(dim=1)
-    padding = -k % _GROUP
-    norms = F.pad(norms, (0, padding), value=torch.inf)
-    transposed = F.pad(centroids, (0, 0, 0, padding)).to(points.dtype).T
-    groups = (k + padding) // _GROUP
-    budget = _CPU_SCORES_PER_BLOCK if points.device.type == "cpu" else _GPU_SCORES_PER_BLOCK
-    found: list[tuple[Tensor, ...]] = []
-    for block in points.split(max(1, budget // (groups * _GROUP))):
-        # |x|² is the same for all centroids and is added at the end.
-        scores = torch.sub(norms, (block @ transposed).to(norms.dtype), alpha=2.0)
-        grouped = scores.unflatten(1, (groups, _GROUP))
-        group = grouped.amin(dim=2).argmin(dim=1)
-        score, member = grouped.gather(1, group[:, None, None].expand(-1, 1, _GROUP)).squeeze(1).min(dim=1)
-        index = group * _GROUP + member
-        if with_second:
-            found.append((index, score, scores.scatter_(1, index[:, None], torch.inf).amin(dim=1)))
-        else:
-            found.append((index, score))
-    index, *costs = (torch.cat(parts) for parts in zip(*found, strict=True))
-    costs = [(cost + squared_norms).clamp(min=0) for cost in costs]
-    return index, costs[0], costs[1] if with_second else None
-
-
-def cluster_means(points: Tensor, assignment: Tensor, centroids: Tensor) -> tuple[Tensor, Tensor]:
-    """Means of the clusters and their sizes; an empty cluster keeps its centroid.
-
-    Sums run over the points of one cluster in order, so the result is deterministic on every device.
-
-    Args:
-        points: (N, d).
-        assignment: (N,) in [0, k).
-        centroids: (k, d).
-
-    Returns:
-        Means (k, d) and sizes (k,).
-    """
-    k = centroids.shape[0]
-    ordered, order = assignment.sort(stable=True)
-    bounds = torch.searchsorted(ordered, torch.arange(k + 1, device=points.device))
-    sizes = bounds.diff()
-    sums = F.embedding_bag(order, points, bounds[:-1], mode="sum")
-    return torch.where(sizes.unsqueeze(1) > 0, sums / sizes.clamp(min=1).unsqueeze(1), centroids), sizes
 
 
 def draw_initial(points: Tensor, num_clusters: int, generator: torch.Generator) -> Tensor:
@@ -293,6 +220,8 @@ def kmeans(
     points = points.detach()
     # Centred, products lose less to rounding.
     centre = points.mean(dim=0)
+    if not bool(torch.isfinite(centre).all()):
+        raise ValueError("points have NaN or infinite entries: check the descriptors")
     points = points - centre
     generator = torch.Generator().manual_seed(seed)
     initial = draw_initial(points, num_clusters, generator)
@@ -351,5 +280,3 @@ def _check_arguments(points: Tensor, num_clusters: int, num_iterations: int) -> 
         )
     if points.shape[0] < num_clusters:
         raise ValueError(f"cannot make {num_clusters} clusters of {points.shape[0]} points")
-    if not bool(torch.isfinite(points).all()):
-        raise ValueError("points have NaN or infinite entries: check the descriptors")

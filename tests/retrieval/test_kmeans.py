@@ -8,11 +8,11 @@ from hypothesis import strategies as st
 from sklearn.cluster import KMeans
 from torch import Tensor
 
+import foundpose.retrieval.assignment as assignment_module
+from foundpose.retrieval.assignment import cluster_means, find_nearest
 from foundpose.retrieval.kmeans import (
-    cluster_means,
     draw_initial,
     fill_empty_clusters,
-    find_nearest,
     kmeans,
     relocate,
     split_gains,
@@ -88,7 +88,7 @@ def test_find_nearest_equals_brute_force(monkeypatch: pytest.MonkeyPatch) -> Non
     x, c = mixture(500, 10, 20, 1.0).double(), mixture(130, 10, 20, 1.0, seed=1).double()
     expected = exact_costs(x, c).topk(2, dim=1, largest=False)
     for budget in (1 << 21, 192 * 7):
-        monkeypatch.setattr(kmeans_module, "_CPU_SCORES_PER_BLOCK", budget)
+        monkeypatch.setattr(assignment_module, "_CPU_SCORES_PER_BLOCK", budget)
         index, cost, second = find_nearest(x, x.square().sum(1), c, with_second=True)
         assert torch.equal(index, expected.indices[:, 0])
         torch.testing.assert_close(cost, expected.values[:, 0])
