@@ -8,10 +8,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from foundpose.features.base import PatchExtractor, PatchFeatures
+from foundpose.features.base import Fingerprint, PatchExtractor, PatchFeatures
 from foundpose.geometry import Crops, PerspectiveCrop, invert_transform
 from foundpose.matching import PatchMatcher
-from foundpose.onboarding import ObjectRepresentation
+from foundpose.onboarding import ObjectRepresentation, RepresentationInfo
 from foundpose.pnp import PnpStatus, RansacPnp
 from foundpose.retrieval import QueryPatches, RetrievedTemplates, TemplateRetriever
 
@@ -119,6 +119,10 @@ class FoundPose(nn.Module):
         self.retriever = retriever
         self.matcher = matcher
         self.pnp = pnp
+        # A fingerprint may cost a pass over all weights, so each representation is checked once. Training the
+        # extractor afterwards is the caller's business.
+        self._fingerprint: Fingerprint | None = None
+        self._checked: list[RepresentationInfo] = []
 
     def forward(
         self,
@@ -142,7 +146,8 @@ class FoundPose(nn.Module):
             object_index: (B,) which object each mask shows; may be left out for a single object.
 
         Raises:
-            ValueError: shapes that do not fit, or an object that was onboarded with another extractor or size.
+            ValueError: shapes that do not fit, or an object that was onboarded with another extractor or size
+                (looked at when an object is first given).
 
         Differentiable w.r.t. ``images``, ``K``, ``boxes`` and the extractor's parameters as far as the stages
         are: crop, descriptors, similarities and descriptor distances are; the choice of templates, of matches
@@ -168,49 +173,27 @@ class FoundPose(nn.Module):
         if len(dimensions) > 1:
             raise ValueError(f"objects must share one PCA dimension, got {sorted(dimensions)}")
         for representation in objects:
-            representation.check_extractor(self.extractor)
+            if any(info is representation.info for info in self._checked):
+                continue
+            if self._fingerprint != representation.info.extractor:
+                self._fingerprint = self.extractor.fingerprint()
+            representation.check_extractor(self._fingerprint)
             if representation.info.image_size != self.crop.size:
                 raise ValueError(
                     f"the templates of {representation.info.name!r} are {representation.info.image_size} px wide, "
                     f"the crops {self.crop.size} px; use one size for both"
                 )
+            self._checked.append(representation.info)
 
     def _match(
         self, objects: list[ObjectRepresentation], members: list[Tensor], raw: QueryPatches
     ) -> tuple[QueryPatches, RetrievedTemplates, Correspondences]:
         """Retrieve and match object by object: the crops of one object share its words and templates."""
-        parts: list[tuple[QueryPatches, RetrievedTemplates, Correspondences]] = []
+        parts = []
         for representation, crop_index in zip(objects, members, strict=True):
-            if len(crop_index) == 0:
-                continue
-            rows = crop_index.to(raw.valid.device)
-            query = _combine([raw], lambda fields: fields[0][rows])  # noqa: B023 - called at once
-            descriptors = query.descriptors.to(representation.projection.components.dtype)
-            query = query._replace(descriptors=representation.projection(descriptors))
-            templates = self.retriever(query, representation)
-            patches = representation.gather_templates(templates.index)
-            template_valid = patches.valid & templates.valid.unsqueeze(-1)
-            matches = self.matcher(
-                query.descriptors, query.valid, patches.descriptors, template_valid, query.pixels
-            )
-            chosen = matches.template_patch.unsqueeze(-1)
-            parts.append(
-                (
-                    query,
-                    templates,
-                    Correspondences(
-                        points_image=query.pixels,
-                        points_model=patches.points_model.gather(2, chosen.expand(-1, -1, -1, 3)).to(
-                            query.pixels
-                        ),
-                        pixels_template=patches.pixels.gather(2, chosen.expand(-1, -1, -1, 2)).to(
-                            query.pixels
-                        ),
-                        distance=matches.distance,
-                        valid=matches.valid,
-                    ),
-                )
-            )
+            if len(crop_index) > 0:
+                rows = crop_index.to(raw.valid.device)
+                parts.append(self._match_object(representation, _take_rows(raw, rows)))
         # Back to the order of the batch.
         order = torch.cat(members).argsort()
 
@@ -219,6 +202,28 @@ class FoundPose(nn.Module):
 
         queries, retrieved, matched = zip(*parts, strict=True)
         return _combine(queries, join), _combine(retrieved, join), _combine(matched, join)
+
+    def _match_object(
+        self, representation: ObjectRepresentation, raw: QueryPatches
+    ) -> tuple[QueryPatches, RetrievedTemplates, Correspondences]:
+        """Project, retrieve and match crops of one object."""
+        descriptors = raw.descriptors.to(representation.projection.components.dtype)
+        query = raw._replace(descriptors=representation.projection(descriptors))
+        templates = self.retriever(query, representation)
+        patches = representation.gather_templates(templates.index)
+        template_valid = patches.valid & templates.valid.unsqueeze(-1)
+        matches = self.matcher(
+            query.descriptors, query.valid, patches.descriptors, template_valid, query.pixels
+        )
+        chosen = matches.template_patch.unsqueeze(-1)
+        correspondences = Correspondences(
+            points_image=query.pixels,
+            points_model=patches.points_model.gather(2, chosen.expand(-1, -1, -1, 3)).to(query.pixels),
+            pixels_template=patches.pixels.gather(2, chosen.expand(-1, -1, -1, 2)).to(query.pixels),
+            distance=matches.distance,
+            valid=matches.valid,
+        )
+        return query, templates, correspondences
 
     def _solve(self, correspondences: Correspondences, K_crop: Tensor) -> PoseHypotheses:
         """PnP for all crops and templates as one batch."""
@@ -319,6 +324,11 @@ def _members(object_index: Tensor | None, count: int, num_objects: int) -> list[
     if count and (int(labels.min()) < 0 or int(labels.max()) >= num_objects):
         raise ValueError(f"object_index must lie in [0, {num_objects}), got {labels.tolist()}")
     return [torch.nonzero(labels == i).flatten() for i in range(num_objects)]
+
+
+def _take_rows(part: _Fields, rows: Tensor) -> _Fields:
+    """Some rows of a named tuple of tensors."""
+    return _combine([part], lambda fields: fields[0][rows])
 
 
 def _combine(parts: Sequence[_Fields], combine: Callable[[list[Tensor]], Tensor]) -> _Fields:

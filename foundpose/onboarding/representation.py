@@ -154,19 +154,22 @@ class ObjectRepresentation(nn.Module):
         parts = {name: tensor.numel() * tensor.element_size() for name, tensor in self.named_buffers()}
         return parts | {"total": sum(parts.values())}
 
-    def check_extractor(self, extractor: PatchExtractor) -> None:
+    def check_extractor(self, fingerprint: Fingerprint) -> None:
         """Refuse an extractor whose descriptors cannot be compared with this representation's.
+
+        Args:
+            fingerprint: of the extractor.
 
         Raises:
             ValueError: names the settings that differ.
         """
-        expected, got = self.info.extractor, extractor.fingerprint()
-        if expected != got:
-            names = sorted(set(expected) | set(got))
+        expected = self.info.extractor
+        if expected != fingerprint:
+            names = sorted(set(expected) | set(fingerprint))
             differences = ", ".join(
-                f"{name}: {expected.get(name)!r} here, {got.get(name)!r} given"
+                f"{name}: {expected.get(name)!r} here, {fingerprint.get(name)!r} given"
                 for name in names
-                if expected.get(name) != got.get(name)
+                if expected.get(name) != fingerprint.get(name)
             )
             raise ValueError(
                 f"the representation of {self.info.name!r} was made with another extractor ({differences}); "
@@ -217,7 +220,7 @@ class ObjectRepresentation(nn.Module):
             info=info,
         )
         if extractor is not None:
-            representation.check_extractor(extractor)
+            representation.check_extractor(extractor.fingerprint())
         return representation
 
 

@@ -45,4 +45,6 @@ class RepresentationStore:
         path = self.path(mesh, name)
         if not path.is_file():
             self.onboarder(mesh, name, progress).save(path)
-        return ObjectRepresentation.load(path, extractor=self.onboarder.extractor)
+        representation = ObjectRepresentation.load(path)
+        representation.check_extractor(self._fingerprint)
+        return representation

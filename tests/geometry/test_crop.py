@@ -204,8 +204,7 @@ def test_gradients_to_image_intrinsics_and_box():
     box = torch.tensor([[3.1, 2.2, 8.4, 7.3]], dtype=torch.float64, requires_grad=True)
     module = PerspectiveCrop(size=7, antialias=False)
     assert torch.autograd.gradcheck(lambda i, k, b: module(i, k, boxes=b).images, (image, K, box), eps=1e-7)
-    outputs = lambda k, b: module(image.detach(), k, boxes=b)[2:4]  # noqa: E731
-    assert torch.autograd.gradcheck(outputs, (K, box))
+    assert torch.autograd.gradcheck(lambda k, b: module(image.detach(), k, boxes=b)[2:4], (K, box))
 
 
 @pytest.mark.parametrize(
