@@ -48,11 +48,11 @@ def blob() -> Mesh:
 
 @pytest.fixture(scope="session")
 def oracle_onboarder() -> Onboarder:
-    """Onboards with codes of true coordinates, 150 templates and 200 words."""
+    """Onboards with codes of true coordinates, 100 templates and 200 words."""
     return Onboarder(
         CoordinateRenderer(),
         CoordinateCode(),
-        SuperFibonacci(150),
+        SuperFibonacci(100),
         VisualWords(200),
         SoftAssignBow(),
         num_components=64,

@@ -40,16 +40,19 @@ def nearest_words(descriptors: Tensor, words: Tensor, num_nearest: int) -> tuple
 
     Differentiable w.r.t. ``descriptors`` and ``words`` (the choice of words is constant).
     """
-    squared_norms = words.detach().square().sum(dim=1)
+    # The choice has no derivative; |x|² is the same for all words.
+    fixed, fixed_words = descriptors.detach(), words.detach()
+    squared_norms = fixed_words.square().sum(dim=1)
+    index = torch.empty(descriptors.shape[0], num_nearest, dtype=torch.int64, device=descriptors.device)
     rows = max(1, _DISTANCES_PER_BLOCK // words.shape[0])
-    distances, indices = [], []
-    for block in descriptors.split(rows):
-        # The choice has no derivative; |x|² is the same for all words.
-        score = torch.addmm(squared_norms, block.detach(), words.detach().T, alpha=-2.0)
-        index = score.topk(num_nearest, dim=1, largest=False).indices
-        distances.append((block.unsqueeze(1) - words[index]).square().sum(dim=-1))
-        indices.append(index)
-    return torch.cat(distances), torch.cat(indices)
+    for start in range(0, descriptors.shape[0], rows):
+        block = slice(start, start + rows)
+        score = torch.addmm(squared_norms, fixed[block], fixed_words.T, alpha=-2.0)
+        index[block] = score.topk(num_nearest, dim=1, largest=False).indices
+    rows = max(1, _DISTANCES_PER_BLOCK // (num_nearest * words.shape[1]))
+    pairs = zip(descriptors.split(rows), index.split(rows), strict=True)
+    distance = torch.cat([(x.unsqueeze(1) - words[i]).square().sum(dim=-1) for x, i in pairs])
+    return distance, index
 
 
 def assign_words(

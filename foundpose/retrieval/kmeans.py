@@ -191,7 +191,7 @@ def kmeans(
     num_clusters: int,
     num_iterations: int = 25,
     seed: int = 0,
-    tolerance: float = 3e-4,
+    tolerance: float = 1e-3,
     progress: Progress | None = None,
 ) -> KMeansResult:
     """Cluster points.

@@ -18,7 +18,7 @@ class VisualWords(nn.Module):
     """
 
     def __init__(
-        self, num_words: int = 2048, num_iterations: int = 25, tolerance: float = 3e-4, seed: int = 0
+        self, num_words: int = 2048, num_iterations: int = 25, tolerance: float = 1e-3, seed: int = 0
     ) -> None:
         super().__init__()
         if num_words < 1 or num_iterations < 1:
