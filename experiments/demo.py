@@ -11,7 +11,7 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from foundpose.config import build_method
+from foundpose.config import build_method, clear_errors
 from foundpose.geometry import rotation_angle
 from foundpose.progress import ProgressBars
 from foundpose.synthetic import cluttered_scene, procedural_mesh
@@ -25,7 +25,14 @@ MAX_TRANSLATION_DIAMETERS = 0.1
 @hydra.main(version_base="1.3", config_path="../conf", config_name="demo")
 def main(cfg: DictConfig) -> None:
     """Run the demo; the exit status is 1 when the pose is wrong."""
-    output = Path(HydraConfig.get().runtime.output_dir)
+    with clear_errors():
+        right = run(cfg, Path(HydraConfig.get().runtime.output_dir))
+    if not right:
+        sys.exit(1)
+
+
+def run(cfg: DictConfig, output: Path) -> bool:
+    """Run the demo and say whether the pose is right."""
     method = build_method(cfg)
     mesh = procedural_mesh(cfg.seed)
     scene = cluttered_scene(mesh, cfg.seed)
@@ -61,8 +68,7 @@ def main(cfg: DictConfig) -> None:
     print(f"translation error: {translation:.2f} mm of {float(mesh.diameter):.0f} mm diameter")
     print(f"overlay: {output / 'overlay.png'}")
     print("pose: right" if right else "pose: WRONG")
-    if not right:
-        sys.exit(1)
+    return right
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ python experiments/estimate.py data=lmo data.root=/path/to/lmo masks=gt extracto
 """
 
 import json
-import time
+import sys
 from collections import defaultdict
 from pathlib import Path
 from typing import Any
@@ -15,18 +15,19 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from kornia.geometry.calibration import undistort_image
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 from tqdm import tqdm
 
 from foundpose.bop import BopDataset, Instance, PoseResult, read_image, read_mask, write_results
-from foundpose.config import Method, build_method, claim_run_folder, clear_errors
+from foundpose.config import Method, build_method, claim_run_folder, clear_errors, wanted_objects
 from foundpose.geometry import boxes_from_xywh, intrinsics_matrix, masks_from_boxes
 from foundpose.io import write_atomically
 from foundpose.onboarding import ObjectRepresentation
 from foundpose.pipeline import PoseEstimates, PoseStatus
 from foundpose.progress import ProgressBars
-from foundpose.rendering import Mesh, load_mesh, warn_if_scale_implausible
+from foundpose.rendering import Mesh, load_mesh
+from foundpose.timing import StageTimer
 from foundpose.visualization import save_estimate_figure
 
 # Settings that may change when a run is resumed.
@@ -51,41 +52,48 @@ def estimate_picture(cfg: DictConfig, output: Path) -> None:
             raise ValueError(f"with image=… give {name}=… too")
     if (cfg.mask is None) == (cfg.box is None):
         raise ValueError("give either mask=… (a picture) or box=[x,y,width,height]")
-    if len(cfg.intrinsics) != 4:
-        raise ValueError(f"intrinsics must be [fx,fy,cx,cy], got {list(cfg.intrinsics)}")
-    image = read_image(Path(cfg.image))
+    fx, fy, cx, cy = numbers(cfg, "intrinsics", "[fx,fy,cx,cy]", 4)
+    if min(fx, fy) <= 0:
+        raise ValueError(f"focal lengths must be positive, got fx={fx}, fy={fy}")
+    K = intrinsics_matrix(fx, fy, cx, cy)
+    image = read_image(cfg.image)
     height, width = image.shape[1:]
-    K = intrinsics_matrix(*cfg.intrinsics)
     if cfg.mask is not None:
-        mask = read_mask(Path(cfg.mask), (height, width))
+        mask = read_mask(cfg.mask, (height, width))
     else:
-        if len(cfg.box) != 4:
-            raise ValueError(f"box must be [x,y,width,height], got {list(cfg.box)}")
-        mask = masks_from_boxes(
-            boxes_from_xywh(torch.tensor([list(cfg.box)], dtype=torch.float32)), height, width
-        )[0]
+        box = numbers(cfg, "box", "[x,y,width,height]", 4)
+        mask = masks_from_boxes(boxes_from_xywh(torch.tensor([box])), height, width)[0]
+        if not bool(mask.any()):
+            raise ValueError(f"box {box} holds no pixel of the image, which is {width}x{height} px")
     if cfg.distortion is not None:
-        image, mask = undistort(image, mask, K, list(cfg.distortion))
+        image, mask = undistort(image, mask, K, numbers(cfg, "distortion", "[k1,k2,p1,p2,…]"))
 
     mesh = load_mesh(cfg.mesh)
     method = build_method(cfg)
     name = Path(cfg.mesh).stem
     representation = method.store.get(mesh, name, ProgressBars(name)).to(cfg.device)
-    start = time.perf_counter()
-    estimates = run_pipeline(
-        method, cfg.device, image, K, mask[None], [representation], torch.zeros(1).long()
-    )
-    seconds = time.perf_counter() - start
+    index = torch.zeros(1, dtype=torch.int64)
+    estimates, seconds = run_pipeline(method, cfg.device, image, K, mask[None], [representation], index)
     facts = describe(estimates, 0) | {"mesh": str(cfg.mesh), "image": str(cfg.image), "time": seconds}
     write_json(output / "estimate.json", facts)
     write_results(output / "results.csv", to_results([facts | {"scene_id": 0, "im_id": 0, "obj_id": 0}]))
     save_estimate_figure(
         output / "overlay.png", image, K, estimates, 0, representation, mesh, method.onboarder.renderer
     )
-    if facts["valid"]:
-        warn_if_scale_implausible(mesh, float(estimates.T_camera_from_model[0, :3, 3].norm()))
     print(json.dumps(facts, indent=1))
     print(f"written to {output}")
+    if not facts["valid"]:
+        print(f"no pose was found: {facts['status']}", file=sys.stderr)
+        sys.exit(1)
+
+
+def numbers(cfg: DictConfig, name: str, form: str, count: int | None = None) -> list[float]:
+    """A list of numbers of the config."""
+    value = OmegaConf.to_container(cfg)[name]  # type: ignore[index,call-overload]
+    right = isinstance(value, list) and all(isinstance(v, int | float) for v in value)
+    if not right or count not in (None, len(value)):
+        raise ValueError(f"{name} must be {form}, got {value}")
+    return [float(v) for v in value]
 
 
 def undistort(image: Tensor, mask: Tensor, K: Tensor, distortion: list[float]) -> tuple[Tensor, Tensor]:
@@ -101,7 +109,7 @@ def estimate_dataset(cfg: DictConfig, output: Path) -> None:
     """All instances of a BOP dataset, image by image; finished images are kept in ``images/`` and not repeated."""
     dataset: BopDataset = instantiate(cfg.data)
     instances: list[Instance] = instantiate(cfg.masks)(dataset)
-    wanted = set(cfg.objects or dataset.object_ids)
+    wanted = wanted_objects(cfg, dataset)
     by_image: dict[tuple[int, int], list[Instance]] = defaultdict(list)
     for instance in instances:
         if instance.obj_id in wanted:
@@ -116,6 +124,11 @@ def estimate_dataset(cfg: DictConfig, output: Path) -> None:
     objects: dict[int, tuple[Mesh, ObjectRepresentation]] = {}
     for obj_id in sorted({i.obj_id for key in images for i in by_image[key]}):
         mesh = load_mesh(dataset.mesh_path(obj_id))
+        if not 0.5 < mesh.diameter / dataset.diameter(obj_id) < 2.0:
+            raise ValueError(
+                f"{dataset.mesh_path(obj_id)} has a diameter of {mesh.diameter:.4g}, models_info.json says "
+                f"{dataset.diameter(obj_id):.4g}: are they in the same unit?"
+            )
         name = f"{dataset.root.name}-{obj_id:06d}"
         objects[obj_id] = (mesh, method.store.get(mesh, name, ProgressBars(name)).to(cfg.device))
 
@@ -129,9 +142,9 @@ def estimate_dataset(cfg: DictConfig, output: Path) -> None:
             masks = torch.stack([instance.mask(dataset) for instance in members])
             ids = sorted({instance.obj_id for instance in members})
             index = torch.tensor([ids.index(instance.obj_id) for instance in members])
-            start = time.perf_counter()
-            estimates = run_pipeline(method, cfg.device, image, K, masks, [objects[i][1] for i in ids], index)
-            seconds = time.perf_counter() - start + max(instance.time for instance in members)
+            shown = [objects[i][1] for i in ids]
+            estimates, seconds = run_pipeline(method, cfg.device, image, K, masks, shown, index)
+            seconds += max(instance.time for instance in members)
             if cfg.overlays and position % cfg.overlays == 0:
                 save_overlays(output / "overlays", dataset, members, K, estimates, objects, method)
             write_json(
@@ -160,10 +173,10 @@ def run_pipeline(
     masks: Tensor,
     objects: list[ObjectRepresentation],
     object_index: Tensor,
-) -> PoseEstimates:
-    """Poses of several masks of one image."""
-    with torch.no_grad():
-        return method.pipeline(
+) -> tuple[PoseEstimates, float]:
+    """Poses of several masks of one image, and the seconds that they took."""
+    with torch.no_grad(), StageTimer({"pipeline": method.pipeline}) as timer:
+        estimates = method.pipeline(
             image[None].to(device),
             K[None].to(device),
             objects,
@@ -171,6 +184,7 @@ def run_pipeline(
             image_index=torch.zeros(len(masks), dtype=torch.int64, device=device),
             object_index=object_index.to(device),
         )
+    return estimates, timer.seconds["pipeline"]
 
 
 def describe(estimates: PoseEstimates, index: int) -> dict[str, Any]:

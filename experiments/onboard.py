@@ -12,7 +12,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 
 from foundpose.bop import BopDataset
-from foundpose.config import Method, build_method, clear_errors
+from foundpose.config import Method, build_method, clear_errors, wanted_objects
 from foundpose.progress import ProgressBars
 from foundpose.rendering import load_mesh
 from foundpose.timing import StageTimer
@@ -25,7 +25,7 @@ def meshes_to_onboard(cfg: DictConfig) -> dict[str, Path]:
     dataset: BopDataset = instantiate(cfg.data)
     return {
         f"{dataset.root.name}-{obj_id:06d}": dataset.mesh_path(obj_id)
-        for obj_id in cfg.objects or dataset.object_ids
+        for obj_id in wanted_objects(cfg, dataset)
     }
 
 

@@ -10,13 +10,16 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
+from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
+from foundpose.bop import BopDataset
 from foundpose.features import PatchExtractor
 from foundpose.io import write_atomically
 from foundpose.onboarding import Onboarder, RepresentationStore
 from foundpose.pipeline import FoundPose
+from foundpose.rendering import RendererNotAvailableError
 
 
 class Method(NamedTuple):
@@ -39,7 +42,10 @@ def build_method(cfg: DictConfig) -> Method:
     Raises:
         ValueError: the device does not exist.
     """
-    device = torch.device(cfg.device)
+    try:
+        device = torch.device(cfg.device)
+    except RuntimeError as error:
+        raise ValueError(f"device must be cpu, cuda, cuda:1 or mps, got {cfg.device!r}") from error
     if device.type == "cuda" and not torch.cuda.is_available():
         raise ValueError("device is 'cuda' but this PyTorch sees no GPU; use device=cpu")
     extractor: PatchExtractor = instantiate(cfg.extractor).to(device).eval()
@@ -51,6 +57,22 @@ def build_method(cfg: DictConfig) -> Method:
         pipeline.to(device).eval(),
         RepresentationStore(cfg.representations, onboarder),
     )
+
+
+def wanted_objects(cfg: DictConfig, dataset: BopDataset) -> list[int]:
+    """The ids in ``cfg.objects``, or all objects of the dataset.
+
+    Raises:
+        ValueError: not a list of the dataset's ids.
+    """
+    if cfg.objects is None:
+        return dataset.object_ids
+    ids = OmegaConf.to_container(cfg.objects) if OmegaConf.is_list(cfg.objects) else cfg.objects
+    if not isinstance(ids, list) or not ids or not set(ids) <= set(dataset.object_ids):
+        raise ValueError(
+            f"objects must be a list of ids from {dataset.object_ids}, as in objects=[1,5]; got {ids}"
+        )
+    return ids
 
 
 def claim_run_folder(folder: Path, cfg: DictConfig, ignore: tuple[str, ...]) -> None:
@@ -89,8 +111,10 @@ def clear_errors() -> Iterator[None]:
     """Turn bad input into one line on standard error and exit status 2; HYDRA_FULL_ERROR=1 shows where it arose."""
     try:
         yield
-    except (ValueError, FileNotFoundError) as error:
+    except (ValueError, FileNotFoundError, RendererNotAvailableError, InstantiationException) as error:
         if os.environ.get("HYDRA_FULL_ERROR") == "1":
             raise
-        print(f"error: {error}", file=sys.stderr)
+        # Hydra wraps what a constructor raises.
+        cause = error.__cause__ if isinstance(error, InstantiationException) and error.__cause__ else error
+        print(f"error: {cause}", file=sys.stderr)
         sys.exit(2)

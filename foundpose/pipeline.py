@@ -71,7 +71,8 @@ class PoseEstimates(NamedTuple):
         T_camera_from_model: (B, 4, 4), mesh units; finite but meaningless where not valid.
         score: (B,) share of the crop's patches that are inliers, in [0, 1].
         num_inliers: (B,) inlier correspondences, the quality by which the best of h hypotheses is chosen.
-        valid: (B,) bool.
+        valid: (B,) bool, a pose with at least the fewest inliers that the PnP stage asks for. It is no confidence:
+            noise can reach that many by chance. Judge by ``score``.
         status: (B,) codes of :class:`PoseStatus`.
         best: (B,) which hypothesis was chosen.
         crops: the perspective crops.
@@ -92,6 +93,30 @@ class PoseEstimates(NamedTuple):
     templates: RetrievedTemplates
     correspondences: Correspondences
     hypotheses: PoseHypotheses
+
+
+class _ExtractorChecks:
+    """Checks once for each representation that it was made with the extractor at hand.
+
+    A fingerprint may cost a pass over all weights, so it is taken when an object or an extractor is new. Training the
+    extractor after that is the caller's business.
+    """
+
+    def __init__(self, capacity: int = 1024) -> None:
+        self.capacity = capacity
+        self._extractor: PatchExtractor | None = None
+        self._fingerprint: Fingerprint = {}
+        self._passed: list[RepresentationInfo] = []
+
+    def __call__(self, representation: ObjectRepresentation, extractor: PatchExtractor) -> None:
+        if extractor is not self._extractor:
+            self._extractor, self._fingerprint, self._passed = extractor, extractor.fingerprint(), []
+        if any(info is representation.info for info in self._passed):
+            return
+        if representation.info.extractor != self._fingerprint:
+            self._fingerprint = extractor.fingerprint()
+        representation.check_extractor(self._fingerprint)
+        self._passed = [*self._passed, representation.info][-self.capacity :]
 
 
 class FoundPose(nn.Module):
@@ -119,10 +144,7 @@ class FoundPose(nn.Module):
         self.retriever = retriever
         self.matcher = matcher
         self.pnp = pnp
-        # A fingerprint may cost a pass over all weights, so each representation is checked once. Training the
-        # extractor afterwards is the caller's business.
-        self._fingerprint: Fingerprint | None = None
-        self._checked: list[RepresentationInfo] = []
+        self._checks = _ExtractorChecks()
 
     def forward(
         self,
@@ -155,16 +177,17 @@ class FoundPose(nn.Module):
         """
         objects = [objects] if isinstance(objects, ObjectRepresentation) else list(objects)
         self._check_objects(objects)
-        crops = self.crop(images, K, masks, boxes, image_index)
+        crops: Crops = self.crop(images, K, masks, boxes, image_index)
         if len(crops.images) == 0:
             raise ValueError("there is nothing to estimate: masks or boxes have length 0")
         members = _members(object_index, len(crops.images), len(objects))
         features = self.extractor(crops.images)
-        raw = select_query_patches(features, crops, self.extractor)
-
-        query, templates, correspondences = self._match(objects, members, raw)
-        hypotheses = self._solve(correspondences, crops.K_crop)
-        return _choose(crops, query, templates, correspondences, hypotheses)
+        # Autocast is for the extractor: elsewhere half precision moves points and changes neighbours.
+        with torch.autocast(crops.images.device.type, enabled=False):
+            raw = select_query_patches(features, crops, self.extractor)
+            query, templates, correspondences = self._match(objects, members, raw)
+            hypotheses = self._solve(correspondences, crops.K_crop)
+            return _choose(crops, query, templates, correspondences, hypotheses)
 
     def _check_objects(self, objects: list[ObjectRepresentation]) -> None:
         if not objects:
@@ -173,17 +196,12 @@ class FoundPose(nn.Module):
         if len(dimensions) > 1:
             raise ValueError(f"objects must share one PCA dimension, got {sorted(dimensions)}")
         for representation in objects:
-            if any(info is representation.info for info in self._checked):
-                continue
-            if self._fingerprint != representation.info.extractor:
-                self._fingerprint = self.extractor.fingerprint()
-            representation.check_extractor(self._fingerprint)
+            self._checks(representation, self.extractor)
             if representation.info.image_size != self.crop.size:
                 raise ValueError(
                     f"the templates of {representation.info.name!r} are {representation.info.image_size} px wide, "
                     f"the crops {self.crop.size} px; use one size for both"
                 )
-            self._checked.append(representation.info)
 
     def _match(
         self, objects: list[ObjectRepresentation], members: list[Tensor], raw: QueryPatches

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from foundpose.features import CoordinateCode
+from foundpose.features import CoordinateCode, PcaProjection
 from foundpose.geometry import SuperFibonacci
 from foundpose.onboarding import ObjectRepresentation, Onboarder
 from foundpose.rendering import CoordinateRenderer, Mesh
@@ -55,7 +55,7 @@ def oracle_onboarder() -> Onboarder:
         SuperFibonacci(100),
         VisualWords(200),
         SoftAssignBow(),
-        num_components=64,
+        projection=PcaProjection(64),
     )
 
 

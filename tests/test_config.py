@@ -1,8 +1,10 @@
+import inspect
 from pathlib import Path
 
 import pytest
+import torch
 from hydra import compose, initialize_config_dir
-from hydra.utils import instantiate
+from hydra.utils import get_class, instantiate
 from omegaconf import OmegaConf
 
 from foundpose.bop import BopDataset
@@ -13,7 +15,18 @@ CONF = Path(__file__).resolve().parents[1] / "conf"
 GROUPS = sorted(
     (group.name, option.stem) for group in CONF.iterdir() if group.is_dir() for option in group.glob("*.yaml")
 )
-MODULES = {"renderer", "viewpoints", "words", "bow", "retrieval", "matcher", "pnp", "crop", "pictures"}
+MODULES = {
+    "renderer",
+    "viewpoints",
+    "words",
+    "bow",
+    "retrieval",
+    "matcher",
+    "pnp",
+    "crop",
+    "pictures",
+    "projection",
+}
 
 
 def load(name="config", *overrides):
@@ -41,8 +54,6 @@ def test_every_option_is_instantiated(group, option, tiny_bop, monkeypatch):
         assert cfg.sigma > 0
     elif group in MODULES:
         assert instantiate(cfg[group]) is not None
-    elif group == "projection":
-        assert cfg.projection.num_components == 256
     elif group == "data":
         assert isinstance(instantiate(cfg.data), BopDataset)
     elif group == "masks":
@@ -77,6 +88,32 @@ def test_every_app_builds_its_method(name, tmp_path):
     assert method.onboarder.extractor is method.pipeline.extractor
     assert method.onboarder.words.num_words == 32
     assert method.onboarder.image_size == method.pipeline.crop.size
+
+
+DELIBERATE = {
+    # (group, option): keys that are what the option is about.
+    ("bow", "hard_assign"): {"num_nearest"},
+    ("matcher", "cyclic"): {"mode", "top_k"},
+}
+
+
+@pytest.mark.parametrize(("group", "option"), [g for g in GROUPS if g[0] in {*MODULES, "extractor"}])
+def test_config_and_constructor_have_the_same_keys_and_defaults(group, option):
+    cfg = load("config", f"{group}={option}")[group]
+    constructor = get_class(cfg._target_)
+    parameters = dict(inspect.signature(constructor.__init__).parameters)
+    parameters.pop("self")
+    if constructor is not torch.nn.Module and all(
+        p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD) for p in parameters.values()
+    ):
+        parameters = {}
+    assert set(parameters) == {key for key in cfg if not str(key).startswith("_")}
+    if group == "extractor":
+        return
+    for name, parameter in parameters.items():
+        submodule = OmegaConf.is_dict(cfg[name])
+        if not submodule and name not in DELIBERATE.get((group, option), ()):
+            assert cfg[name] == parameter.default, name
 
 
 def test_a_device_that_is_not_there(monkeypatch):

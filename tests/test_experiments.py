@@ -2,6 +2,7 @@ import json
 import os
 import re
 import runpy
+import shutil
 import signal
 import subprocess
 import sys
@@ -115,6 +116,13 @@ def test_own_picture_with_mask_box_and_distortion(own_picture, monkeypatch, tmp_
         (["box=[1,2,3]"], "box must be [x,y,width,height], got [1, 2, 3]"),
         (["intrinsics=null", "box=[1,2,3,4]"], "give intrinsics=… too"),
         (["intrinsics=[600]", "box=[1,2,3,4]"], "intrinsics must be [fx,fy,cx,cy], got [600]"),
+        (["intrinsics=600", "box=[1,2,3,4]"], "intrinsics must be [fx,fy,cx,cy], got 600"),
+        (["intrinsics=[0,0,0,0]", "box=[1,2,3,4]"], "focal lengths must be positive, got fx=0.0, fy=0.0"),
+        (["box=5"], "box must be [x,y,width,height], got 5"),
+        (["box=[900,2,3,4]"], "holds no pixel of the image, which is 640x480 px"),
+        (["box=[1,2,30,40]", "device=gpu"], "device must be cpu, cuda, cuda:1 or mps, got 'gpu'"),
+        (["box=[1,2,30,40]", "extractor=dinov2_vits14", "extractor.layer=50"], "layer must be in 0..11"),
+        (["box=[1,2,30,40]", "projection.num_components=999"], "descriptors have 256 channels"),
         (["mesh=none.ply", "box=[1,2,30,40]"], "none.ply"),
         (
             ["distortion=[0.1]", "box=[1,2,30,40]"],
@@ -132,6 +140,50 @@ def test_bad_input_is_one_clear_line(own_picture, monkeypatch, tmp_path, capsys,
     lines = capsys.readouterr().err.strip().splitlines()
     assert lines[-1].startswith("error: ")
     assert message in lines[-1]
+    assert not (tmp_path / "estimate.json").exists()
+
+
+def test_missing_weights_say_how_to_get_them(own_picture, monkeypatch, tmp_path, capsys):
+    _, _, _, arguments = own_picture
+    with pytest.raises(SystemExit) as stop:
+        run_app(
+            monkeypatch,
+            "estimate",
+            *arguments,
+            "box=[1,2,30,40]",
+            "extractor=dinov2_vits14_reg",
+            f"extractor.weights={tmp_path / 'dinov2_vits14_reg4_pretrain.pth'}",
+            f"hydra.run.dir={tmp_path}",
+        )
+    assert stop.value.code == 2
+    message = capsys.readouterr().err
+    assert "error: " in message
+    assert "dinov2_vits14_reg4_pretrain.pth" in message
+    assert "hf download" in message
+    assert "\\n" not in message
+
+
+def test_a_picture_without_a_pose_is_a_failure(own_picture, monkeypatch, tmp_path, capsys):
+    _, _, _, arguments = own_picture
+    # A single pixel is no region to look at.
+    with pytest.raises(SystemExit) as stop:
+        run_app(monkeypatch, "estimate", *arguments, "box=[5,5,1,1]", f"hydra.run.dir={tmp_path}")
+    assert stop.value.code == 1
+    assert "no pose was found: UNUSABLE_MASK" in capsys.readouterr().err
+    assert json.loads((tmp_path / "estimate.json").read_text())["valid"] is False
+    assert read_results(tmp_path / "results.csv") == []
+
+
+def test_demo_fails_when_the_pose_is_wrong(monkeypatch, tmp_path, capsys):
+    # Three templates do not show the side that the picture shows.
+    arguments = ["viewpoints.count=3", "words.num_words=32", f"representations={tmp_path}"]
+    with pytest.raises(SystemExit) as stop:
+        run_app(monkeypatch, "demo", *arguments, f"hydra.run.dir={tmp_path / 'out'}")
+    assert stop.value.code == 1
+    out = capsys.readouterr().out
+    assert "pose: WRONG" in out
+    assert "rotation error: " in out
+    assert (tmp_path / "out" / "overlay.png").stat().st_size > 10_000
 
 
 def bop_arguments(root, tmp_path):
@@ -175,6 +227,23 @@ def test_a_run_is_resumed_and_guarded(tiny_bop, monkeypatch, tmp_path, capsys):
     with pytest.raises(SystemExit):
         run_app(monkeypatch, "estimate", *arguments, "pnp.iterations=50")
     assert "holds a run with other settings" in capsys.readouterr().err
+
+
+def test_meshes_in_another_unit_and_unknown_objects_are_refused(tiny_bop, monkeypatch, tmp_path, capsys):
+    root = shutil.copytree(tiny_bop, tmp_path / "data")
+    info = {str(i): {"diameter": 0.12} for i in (1, 2)}
+    (root / "models" / "models_info.json").write_text(json.dumps(info))
+    arguments = [*bop_arguments(root, tmp_path), f"hydra.run.dir={tmp_path / 'run'}"]
+    for change, message in (
+        ([], "are they in the same unit?"),
+        (["objects=[7]"], "objects must be a list of ids from [1, 2]"),
+        (["objects=5"], "objects must be a list of ids from [1, 2]"),
+        ([f"data.root={tmp_path / 'nowhere'}"], "no BOP dataset at"),
+    ):
+        with pytest.raises(SystemExit) as stop:
+            run_app(monkeypatch, "estimate", *arguments, *change)
+        assert stop.value.code == 2
+        assert message in capsys.readouterr().err.strip().splitlines()[-1]
 
 
 def test_killed_onboarding_and_estimation_lose_nothing(tiny_bop, tmp_path):

@@ -149,7 +149,7 @@ class BopDataset:
     def visible_mask(self, scene_id: int, im_id: int, annotation_index: int) -> Tensor:
         """Ground-truth mask (H, W) bool of the visible part of an instance."""
         path = self._scene(scene_id) / "mask_visib" / f"{im_id:06d}_{annotation_index:06d}.png"
-        return read_mask(path)
+        return read_mask(path, self.image_size(scene_id, im_id), may_be_empty=True)
 
     def _scene(self, scene_id: int) -> Path:
         scene = self.split / f"{scene_id:06d}"

@@ -66,18 +66,24 @@ def read_image(path: str | Path) -> Tensor:
     return pixels[..., :3].permute(2, 0, 1).contiguous()
 
 
-def read_mask(path: str | Path, size: tuple[int, int] | None = None) -> Tensor:
+def read_mask(path: str | Path, size: tuple[int, int] | None = None, may_be_empty: bool = False) -> Tensor:
     """Read a mask as (H, W) bool: True where any channel is above half of the range.
 
     Args:
         path: a picture.
         size: expected (height, width).
+        may_be_empty: accept a mask without a bright pixel.
 
     Raises:
         FileNotFoundError: no such file.
-        BopError: not a picture, or one of another size.
+        BopError: not a picture, one of another size, or (unless ``may_be_empty``) one without a bright pixel.
     """
     mask = read_image(path).amax(dim=0) > 0.5
+    if not may_be_empty and not bool(mask.any()):
+        brightest = round(float(read_image(path).max()) * 255)
+        raise BopError(
+            f"the mask {path} is empty: no pixel is above half of the range (the brightest is {brightest} of 255)"
+        )
     if size is not None and tuple(mask.shape) != tuple(size):
         raise BopError(
             f"the mask {path} is {mask.shape[1]}x{mask.shape[0]} px, its image {size[1]}x{size[0]} px"

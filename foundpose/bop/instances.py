@@ -37,9 +37,20 @@ class Instance:
     annotation_index: int | None = None
 
     def mask(self, dataset: BopDataset) -> Tensor:
-        """The mask (H, W) bool."""
+        """The mask (H, W) bool.
+
+        Raises:
+            BopError: a mask of another size than its image.
+        """
         if self.segmentation is not None:
-            return decode_rle(self.segmentation)
+            mask = decode_rle(self.segmentation)
+            size = dataset.image_size(self.scene_id, self.im_id)
+            if tuple(mask.shape) != size:
+                raise BopError(
+                    f"a detection of object {self.obj_id} in image {self.im_id} of scene {self.scene_id} has "
+                    f"a mask of {mask.shape[1]}x{mask.shape[0]} px, the image has {size[1]}x{size[0]} px"
+                )
+            return mask
         assert self.annotation_index is not None
         return dataset.visible_mask(self.scene_id, self.im_id, self.annotation_index)
 

@@ -21,8 +21,9 @@ class Crops(NamedTuple):
         K_crop: (B, 3, 3) intrinsics of the virtual cameras, pixels.
         T_crop_from_camera: (B, 4, 4) rotations of the virtual cameras.
         boxes: (B, 4) boxes in the image that the crops are focused on, pixel edges.
-        valid: (B,) False for a mask that is empty or smaller than ``min_box_size``, and for a box that is
-            degenerate or outside its image. Such a crop shows the whole image, its mask is zero.
+        valid: (B,) False for a mask that is empty or smaller than ``min_box_size``, for a box that is degenerate
+            or outside its image, and for intrinsics that are no camera's. Such a crop shows the whole image, its
+            mask is zero.
     """
 
     images: Tensor
@@ -77,21 +78,35 @@ class PerspectiveCrop(nn.Module):
             boxes: (B, 4) as ``(left, top, right, bottom)`` pixel edges.
             image_index: (B,) which image each mask belongs to; may be left out where B == N.
 
+        Returns:
+            The crops; pictures in the dtype of ``images``, cameras in at least single precision.
+
         Raises:
             ValueError: shapes or values that do not fit.
 
         Differentiable w.r.t. ``images``, ``K`` and ``boxes`` (the pyramid level is held fixed).
         """
         image_index = _check_inputs(images, K, masks, boxes, image_index)
+        # Half precision and autocast move pixels: cameras and warps are computed in single precision at least.
+        dtype = torch.promote_types(images.dtype, torch.float32)
+        boxes = None if boxes is None else boxes.to(images.device, dtype)
+        with torch.autocast(images.device.type, enabled=False):
+            crops = self._crop(images.to(dtype), K.to(images.device, dtype), masks, boxes, image_index)
+        return crops._replace(images=crops.images.to(images.dtype))
+
+    def _crop(
+        self, images: Tensor, K: Tensor, masks: Tensor | None, boxes: Tensor | None, image_index: Tensor
+    ) -> Crops:
         height, width = images.shape[-2:]
+        K, is_camera = _usable_intrinsics(K)
         if masks is not None:
             mask_boxes, occupied = boxes_from_masks(masks)
-            boxes = mask_boxes.to(images.dtype) if boxes is None else boxes
+            boxes = mask_boxes.to(K) if boxes is None else boxes
         else:
             assert boxes is not None
             occupied = torch.ones(len(boxes), dtype=torch.bool, device=boxes.device)
         boxes, valid = _usable_boxes(boxes, height, width, self.min_box_size)
-        valid = valid & occupied
+        valid = valid & occupied & is_camera[image_index]
 
         K_camera = K[image_index]
         K_crop, T_crop_from_camera = camera_on_boxes(boxes, K_camera, self.size, self.fill)
@@ -151,6 +166,14 @@ def warp_images(
     return out
 
 
+def _usable_intrinsics(K: Tensor) -> tuple[Tensor, Tensor]:
+    """Replace intrinsics (N, 3, 3) that are no pinhole camera's; say which ones were usable."""
+    focal = K[:, [0, 1], [0, 1]]
+    bottom = K.new_tensor([0.0, 0.0, 1.0])
+    usable = torch.isfinite(K).all(dim=(1, 2)) & (focal > 0).all(dim=1) & (K[:, 2] == bottom).all(dim=1)
+    return torch.where(usable[:, None, None], K, torch.eye(3, device=K.device, dtype=K.dtype)), usable
+
+
 def _usable_boxes(boxes: Tensor, height: int, width: int, min_size: float) -> tuple[Tensor, Tensor]:
     """Replace boxes that cannot be cropped by the whole image; say which ones were usable."""
     left, top, right, bottom = boxes.unbind(-1)
@@ -187,6 +210,10 @@ def _check_inputs(
         if count != num_images:
             raise ValueError(f"image_index is needed: {count} masks or boxes for {num_images} images")
         return torch.arange(count, device=images.device)
-    if image_index.shape != (count,) or image_index.is_floating_point():
-        raise ValueError(f"image_index must be ({count},) integers, got {tuple(image_index.shape)}")
+    if image_index.shape != (count,) or image_index.is_floating_point() or image_index.dtype == torch.bool:
+        raise ValueError(
+            f"image_index must be ({count},) integers, got {tuple(image_index.shape)} {image_index.dtype}"
+        )
+    if count and not 0 <= int(image_index.min()) <= int(image_index.max()) < num_images:
+        raise ValueError(f"image_index must lie in [0, {num_images}), got {image_index.tolist()}")
     return image_index.to(images.device)

@@ -1,6 +1,8 @@
 """From a mesh to an object representation."""
 
-from typing import NamedTuple, Protocol
+import copy
+from itertools import chain
+from typing import NamedTuple, Protocol, get_args
 
 import torch
 from torch import Tensor, nn
@@ -41,7 +43,7 @@ class Onboarder(nn.Module):
         viewpoints: module that returns the orientations of the templates (T, 3, 3).
         words: clusters projected descriptors to visual words.
         bow: makes the templates' bags of words; its settings must be those of the retriever.
-        num_components: number d of PCA components.
+        projection: says how many PCA components there are; each object gets a fitted copy.
         image_size: side S of a template in pixels.
         fill: δ, share of the side that the object's 2D box takes.
         distance: distance of the templates' cameras in diameters.
@@ -57,7 +59,7 @@ class Onboarder(nn.Module):
         viewpoints: nn.Module,
         words: VisualWords,
         bow: SoftAssignBow,
-        num_components: int = 256,
+        projection: PcaProjection | None = None,
         image_size: int = 420,
         fill: float = 0.6,
         distance: float = 6.0,
@@ -66,6 +68,16 @@ class Onboarder(nn.Module):
         batch_size: int = 16,
     ) -> None:
         super().__init__()
+        projection = PcaProjection() if projection is None else projection
+        if projection.num_components > extractor.channels:
+            raise ValueError(
+                f"num_components is {projection.num_components} but the extractor's descriptors have "
+                f"{extractor.channels} channels; set projection.num_components to at most that"
+            )
+        if idf_mode not in get_args(IdfMode):
+            raise ValueError(f"idf_mode must be one of {get_args(IdfMode)}, got {idf_mode!r}")
+        if not 0.0 < fill <= 1.0:
+            raise ValueError(f"fill must be in (0, 1], got {fill}")
         if mask_erosion < 0 or (mask_erosion > 0 and mask_erosion % 2 == 0):
             raise ValueError(f"mask_erosion must be 0 or odd, got {mask_erosion}")
         if distance <= 1.0:
@@ -77,7 +89,7 @@ class Onboarder(nn.Module):
         self.viewpoints = viewpoints
         self.words = words
         self.bow = bow
-        self.num_components = num_components
+        self.projection = projection
         self.image_size = image_size
         self.fill = fill
         self.distance = distance
@@ -91,7 +103,7 @@ class Onboarder(nn.Module):
             "viewpoints": repr(self.viewpoints),
             "words": repr(self.words),
             "bow": repr(self.bow),
-            "num_components": self.num_components,
+            "num_components": self.projection.num_components,
             "image_size": self.image_size,
             "fill": self.fill,
             "distance": self.distance,
@@ -100,7 +112,7 @@ class Onboarder(nn.Module):
             "renderer": repr(self.renderer),
         }
 
-    @torch.no_grad()
+    @torch.no_grad()  # clustering has no derivative, and a graph over all templates would fill the memory
     def forward(self, mesh: Mesh, name: str, progress: Progress | None = None) -> ObjectRepresentation:
         """Onboard an object.
 
@@ -110,21 +122,25 @@ class Onboarder(nn.Module):
             progress: is told of every batch of templates and of every later stage.
 
         Returns:
-            The representation, on the device of the extractor's parameters (the CPU if it has none).
+            The representation, on the device of the extractor's parameters and buffers (the CPU if it has none).
 
         Raises:
             ValueError: too few patches for the PCA or the words.
 
         Not differentiable: what comes out are constants of later stages.
         """
-        report = progress or _no_progress
-        device = next((p.device for p in self.extractor.parameters()), torch.device("cpu"))
+        state = next(chain(self.extractor.parameters(), self.extractor.buffers()), torch.empty(0))
+        # Autocast would move template cameras and points; the extractor has a precision of its own.
+        with torch.autocast(state.device.type, enabled=False):
+            return self._onboard(mesh, name, state.device, progress or _no_progress)
+
+    def _onboard(self, mesh: Mesh, name: str, device: torch.device, report: Progress) -> ObjectRepresentation:
         rotations = self.viewpoints().to(device=device, dtype=torch.float32)
         cameras = template_cameras(mesh, rotations, self.image_size, self.fill, self.distance)
         raw, accumulator = self._describe_templates(mesh, cameras, report)
 
         report("PCA", 0, 1)
-        projection = PcaProjection(self.num_components).to(device).fit(accumulator)
+        projection = copy.deepcopy(self.projection).to(device).fit(accumulator)
         # One batch at a time, freeing the raw descriptors on the way.
         projected = []
         while raw.descriptors:
@@ -139,6 +155,7 @@ class Onboarder(nn.Module):
 
         counts = torch.cat(raw.counts)
         grid = self.extractor.grid_size(self.image_size)
+        cell_type = torch.int16 if grid**2 <= torch.iinfo(torch.int16).max else torch.int32
         representation = ObjectRepresentation(
             projection=projection,
             words=words,
@@ -146,7 +163,7 @@ class Onboarder(nn.Module):
             template_bow=words.new_zeros(len(counts), len(words)),
             descriptors=descriptors,
             points_model=torch.cat(raw.points_model).to(device),
-            patch_index=torch.cat(raw.patch_index).to(device=device, dtype=torch.int16),
+            patch_index=torch.cat(raw.patch_index).to(device=device, dtype=cell_type),
             template_offsets=torch.cat([counts.new_zeros(1), counts.cumsum(0)]).to(device),
             T_template_from_model=cameras.T_template_from_model,
             K_template=cameras.K_template,

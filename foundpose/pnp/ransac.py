@@ -66,7 +66,7 @@ class RansacPnp(nn.Module):
         threshold: largest distance of an inlier's projection from its pixel, in pixels.
         min_inliers: poses with fewer inliers are flagged. (Four points always fit themselves.)
         confidence: stop a problem's sampling once an all-inlier sample has been drawn with this probability,
-            judged by the best inlier ratio so far; None draws all samples, as the paper does.
+            judged by the best inlier ratio so far; None draws all samples.
         polish_rounds: how often the inliers are selected anew and the pose polished on them.
         polish_iterations: Levenberg-Marquardt iterations in each round.
         loss: robust loss of the polish on squared pixel distances; None means least squares.

@@ -2,7 +2,7 @@
 
 from foundpose.rendering.base import Renderer, RenderOutput
 from foundpose.rendering.coordinates import CoordinateRenderer, render_coordinate_image
-from foundpose.rendering.gl import PyrenderRenderer
+from foundpose.rendering.gl import PyrenderRenderer, RendererNotAvailableError
 from foundpose.rendering.mesh import Mesh, MeshError, load_mesh, warn_if_scale_implausible
 from foundpose.rendering.raycast import RaycastRenderer
 
@@ -14,6 +14,7 @@ __all__ = [
     "RaycastRenderer",
     "RenderOutput",
     "Renderer",
+    "RendererNotAvailableError",
     "load_mesh",
     "render_coordinate_image",
     "warn_if_scale_implausible",

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from foundpose.geometry import invert_transform, pixel_grid, transform_points, unproject_pixels
+from foundpose.geometry import pixel_grid, transform_points, unproject_pixels
 from foundpose.rendering.base import RenderOutput
 from foundpose.rendering.mesh import Mesh
 from foundpose.rendering.raycast import RaycastRenderer
@@ -32,7 +32,8 @@ class CoordinateRenderer(RaycastRenderer):
         render = super().forward(mesh, T_camera_from_model, K, size)
         pixels = pixel_grid(*size, render.depth.device, render.depth.dtype).reshape(-1, 2)
         points_camera = unproject_pixels(pixels, render.depth.flatten(1), K.to(render.depth))
-        points = transform_points(invert_transform(T_camera_from_model), points_camera)
+        # A true inverse: annotated rotations may be scaled by half a percent.
+        points = transform_points(torch.linalg.inv(T_camera_from_model), points_camera)
         centre = mesh.bounds.to(points).mean(dim=0)
         colors = COLOR_CENTRE + COLOR_RANGE * (points - centre) / mesh.diameter
         rgb = colors.transpose(1, 2).reshape(len(points), 3, *size)

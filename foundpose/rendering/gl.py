@@ -20,6 +20,10 @@ _HELP = (
 )
 
 
+class RendererNotAvailableError(RuntimeError):
+    """This machine lacks what a renderer needs."""
+
+
 class FaceRasterizer:
     """An EGL context that tells which face each pixel sees.
 
@@ -31,7 +35,7 @@ class FaceRasterizer:
         size: (height, width) of the images.
 
     Raises:
-        RuntimeError: no pyrender or no EGL.
+        RendererNotAvailableError: no pyrender or no EGL.
     """
 
     def __init__(self, size: tuple[int, int]) -> None:
@@ -42,7 +46,7 @@ class FaceRasterizer:
 
             self.context = pyrender.OffscreenRenderer(viewport_width=size[1], viewport_height=size[0])
         except Exception as error:  # ImportError, or whatever the driver and PyOpenGL raise
-            raise RuntimeError(f"{_HELP} ({type(error).__name__}: {error})") from error
+            raise RendererNotAvailableError(f"{_HELP} ({type(error).__name__}: {error})") from error
         self.context._renderer._program_cache = ShaderProgramCache(str(_SHADERS))
         self.pyrender = pyrender
         self.scene = pyrender.Scene()
@@ -108,7 +112,7 @@ class PyrenderRenderer(Renderer):
         ambient: share of ambient light in [0, 1]; the rest shines along the camera's axis.
 
     Raises:
-        RuntimeError: (on the first call) pyrender or EGL is missing.
+        RendererNotAvailableError: (on the first call) pyrender or EGL is missing.
         ValueError: (on a call) intrinsics with skew, which OpenGL's camera does not have here.
     """
 

@@ -200,11 +200,53 @@ def test_antialiasing_where_the_crop_shrinks():
 def test_gradients_to_image_intrinsics_and_box():
     gen = torch.Generator().manual_seed(0)
     image = torch.rand(1, 3, 12, 14, generator=gen, dtype=torch.float64, requires_grad=True)
-    K = intrinsics_matrix(20.0, 21.0, 6.3, 5.4).double()[None].requires_grad_()
+    top = intrinsics_matrix(20.0, 21.0, 6.3, 5.4).double()[:2].requires_grad_()
+    bottom = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
     box = torch.tensor([[3.1, 2.2, 8.4, 7.3]], dtype=torch.float64, requires_grad=True)
     module = PerspectiveCrop(size=7, antialias=False)
-    assert torch.autograd.gradcheck(lambda i, k, b: module(i, k, boxes=b).images, (image, K, box), eps=1e-7)
-    assert torch.autograd.gradcheck(lambda k, b: module(image.detach(), k, boxes=b)[2:4], (K, box))
+
+    def crop(i, k, b):
+        return module(i, torch.cat([k, bottom])[None], boxes=b)
+
+    assert torch.autograd.gradcheck(lambda i, k, b: crop(i, k, b).images, (image, top, box), eps=1e-7)
+    assert torch.autograd.gradcheck(lambda k, b: crop(image.detach(), k, b)[2:4], (top, box))
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision_pictures_and_mixed_types(dtype):
+    image = torch.rand(1, 3, 60, 80, generator=torch.Generator().manual_seed(2))
+    K = intrinsics_matrix(100.0, 101.0, 39.5, 29.5)[None].double()
+    mask = disc_mask(60, 80, 50, 30, 9)[None]
+    module = PerspectiveCrop(size=56)
+    half, full = module(image.to(dtype), K, mask), module(image, K, mask)
+    assert half.images.dtype == dtype
+    assert half.K_crop.dtype == full.K_crop.dtype == torch.float32
+    assert torch.equal(half.K_crop, full.K_crop)
+    assert (half.images.float() - full.images).abs().max() < 0.01
+    integer_box = module(image, K, boxes=torch.tensor([[40, 20, 60, 40]]))
+    assert integer_box.boxes.dtype == torch.float32
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert torch.equal(module(image, K, mask).images, full.images)
+
+
+def test_unusable_cameras_are_flagged():
+    image = torch.rand(5, 3, 40, 40, generator=torch.Generator().manual_seed(0))
+    K = intrinsics_matrix(50.0, 50.0, 19.5, 19.5).repeat(5, 1, 1)
+    K[1], K[2], K[3, 0, 0], K[4, 2, 2] = 0.0, torch.nan, -50.0, 2.0
+    crops = PerspectiveCrop(size=28)(image, K, disc_mask(40, 40, 20, 20, 8).expand(5, 40, 40))
+    assert crops.valid.tolist() == [True, False, False, False, False]
+    assert all(torch.isfinite(t).all() for t in crops)
+
+
+def test_crops_of_one_image_share_its_memory():
+    image = torch.rand(1, 3, 1500, 2000, generator=torch.Generator().manual_seed(0))
+    homographies, index = torch.eye(3).repeat(20, 1, 1), torch.zeros(20, dtype=torch.int64)
+    activities = [torch.profiler.ProfilerActivity.CPU]
+    with torch.profiler.profile(activities=activities, profile_memory=True) as profile:
+        warp_images(image, homographies, index, torch.zeros(20), 28)
+    allocated = sum(max(event.self_cpu_memory_usage, 0) for event in profile.key_averages())
+    # One copy of the picture takes 36 MB.
+    assert 0 < allocated < image.numel() * 4
 
 
 @pytest.mark.parametrize(
@@ -218,6 +260,9 @@ def test_gradients_to_image_intrinsics_and_box():
         ({"masks": None}, "give masks"),
         ({"masks": torch.ones(2, 20, 20)}, "image_index is needed"),
         ({"image_index": torch.tensor([0.5])}, "image_index must be"),
+        ({"image_index": torch.tensor([True])}, r"image_index must be .* torch\.bool"),
+        ({"image_index": torch.tensor([-1])}, r"image_index must lie in \[0, 1\), got \[-1\]"),
+        ({"image_index": torch.tensor([3])}, r"image_index must lie in \[0, 1\), got \[3\]"),
         ({"boxes": torch.ones(1, 5)}, r"boxes must have shape \(B, 4\)"),
     ],
 )

@@ -3,7 +3,7 @@ import pytest
 import torch
 from sklearn.decomposition import PCA
 
-from foundpose.features import CoordinateCode, DenseSift
+from foundpose.features import CoordinateCode, DenseSift, PcaProjection
 from foundpose.geometry import SphereInplane, SuperFibonacci, project_points, transform_points
 from foundpose.onboarding import ObjectRepresentation, Onboarder, RepresentationStore
 from foundpose.rendering import CoordinateRenderer, RaycastRenderer
@@ -17,7 +17,7 @@ def make_onboarder(**changes):
         "viewpoints": SuperFibonacci(12),
         "words": VisualWords(64),
         "bow": SoftAssignBow(),
-        "num_components": 32,
+        "projection": PcaProjection(32),
     }
     return Onboarder(**(settings | changes))
 
@@ -108,12 +108,20 @@ def test_bad_settings(blob):
     for change, message in (
         ({"mask_erosion": 4}, "mask_erosion must be 0 or odd, got 4"),
         ({"distance": 0.5}, "more than one diameter, got 0.5"),
+        ({"idf_mode": "log"}, "idf_mode must be one of .*, got 'log'"),
+        ({"fill": 1.2}, r"fill must be in \(0, 1\], got 1.2"),
         ({"batch_size": 0}, "batch_size must be at least 1, got 0"),
     ):
         with pytest.raises(ValueError, match=message):
             make_onboarder(**change)
-    with pytest.raises(ValueError, match="num_components"):
-        make_onboarder(num_components=300)(blob, "blob")
+    with pytest.raises(
+        ValueError, match="num_components is 300 but the extractor's descriptors have 256 channels"
+    ):
+        make_onboarder(projection=PcaProjection(300))
+    with pytest.raises(ValueError, match="cannot make 64 clusters of"):
+        make_onboarder(
+            viewpoints=SuperFibonacci(1), extractor=CoordinateCode(stride=70.0), projection=PcaProjection(2)
+        )(blob, "blob")
 
 
 def test_store_onboards_once_and_separates_settings(blob, tmp_path):
@@ -127,7 +135,7 @@ def test_store_onboards_once_and_separates_settings(blob, tmp_path):
     second = store.get(blob, "blob", lambda *call: calls.append(call))
     assert not calls
     assert torch.equal(first.descriptors, second.descriptors)
-    other = RepresentationStore(tmp_path, make_onboarder(num_components=16))
+    other = RepresentationStore(tmp_path, make_onboarder(projection=PcaProjection(16)))
     assert not other.has(blob, "blob")
     assert other.path(blob, "blob") != store.path(blob, "blob")
     assert isinstance(ObjectRepresentation.load(store.path(blob, "blob")), ObjectRepresentation)

@@ -73,7 +73,8 @@ def test_gathering_is_differentiable(oracle_blob):
     r.gather_templates(torch.tensor([5])).descriptors.square().sum().backward()
     rows = slice(int(r.template_offsets[5]), int(r.template_offsets[6]))
     assert torch.allclose(r.descriptors.grad[rows], 2 * r.descriptors.detach()[rows])
-    assert r.descriptors.grad.abs().sum() == r.descriptors.grad[rows].abs().sum()
+    r.descriptors.grad[rows] = 0.0
+    assert (r.descriptors.grad == 0).all()
 
 
 def test_memory_is_counted_by_part(oracle_blob):
