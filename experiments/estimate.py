@@ -69,6 +69,7 @@ def estimate_picture(cfg: DictConfig, output: Path) -> None:
         image, mask = undistort(image, mask, K, numbers(cfg, "distortion", "[k1,k2,p1,p2,…]"))
 
     mesh = load_mesh(cfg.mesh)
+    claim_run_folder(output, cfg, MAY_CHANGE)
     method = build_method(cfg)
     name = Path(cfg.mesh).stem
     representation = method.store.get(mesh, name, ProgressBars(name)).to(cfg.device)

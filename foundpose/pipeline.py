@@ -1,5 +1,6 @@
 """The composed method: from images and masks to coarse poses."""
 
+import warnings
 from collections.abc import Callable, Sequence
 from enum import IntEnum
 from typing import Any, NamedTuple, TypeVar, cast
@@ -108,15 +109,17 @@ class _ExtractorChecks:
         self._fingerprint: Fingerprint = {}
         self._passed: list[RepresentationInfo] = []
 
-    def __call__(self, representation: ObjectRepresentation, extractor: PatchExtractor) -> None:
+    def __call__(self, representation: ObjectRepresentation, extractor: PatchExtractor) -> bool:
+        """Raise ValueError for another extractor; say whether the representation had not been seen before."""
         if extractor is not self._extractor:
             self._extractor, self._fingerprint, self._passed = extractor, extractor.fingerprint(), []
         if any(info is representation.info for info in self._passed):
-            return
+            return False
         if representation.info.extractor != self._fingerprint:
             self._fingerprint = extractor.fingerprint()
         representation.check_extractor(self._fingerprint)
         self._passed = [*self._passed, representation.info][-self.capacity :]
+        return True
 
 
 class FoundPose(nn.Module):
@@ -196,11 +199,24 @@ class FoundPose(nn.Module):
         if len(dimensions) > 1:
             raise ValueError(f"objects must share one PCA dimension, got {sorted(dimensions)}")
         for representation in objects:
-            self._checks(representation, self.extractor)
+            if self._checks(representation, self.extractor):
+                self._warn_of_other_settings(representation)
             if representation.info.image_size != self.crop.size:
                 raise ValueError(
                     f"the templates of {representation.info.name!r} are {representation.info.image_size} px wide, "
                     f"the crops {self.crop.size} px; use one size for both"
+                )
+
+    def _warn_of_other_settings(self, representation: ObjectRepresentation) -> None:
+        """Templates and crops can be compared, but badly, if they were made with other settings."""
+        mine = {"fill": self.crop.fill, "bow": repr(self.retriever.bow)}
+        for name, value in mine.items():
+            theirs = representation.info.settings.get(name, value)
+            if theirs != value:
+                warnings.warn(
+                    f"{representation.info.name!r} was onboarded with {name}={theirs}, the pipeline uses {value}; "
+                    "retrieval suffers when they differ",
+                    stacklevel=4,
                 )
 
     def _match(

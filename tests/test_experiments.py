@@ -62,7 +62,7 @@ def pose_error(output, scene, mesh):
     return float(angle), float((torch.tensor(facts["t"]) - T[:3, 3]).norm() / mesh.diameter)
 
 
-def test_own_picture_with_mask_box_and_distortion(own_picture, monkeypatch, tmp_path):
+def test_own_picture_with_mask_box_and_distortion(own_picture, monkeypatch, tmp_path, capsys):
     folder, scene, mesh, arguments = own_picture
     run_app(
         monkeypatch, "estimate", *arguments, f"mask={folder / 'mask.png'}", f"hydra.run.dir={tmp_path / 'a'}"
@@ -73,6 +73,11 @@ def test_own_picture_with_mask_box_and_distortion(own_picture, monkeypatch, tmp_
     assert (tmp_path / "a" / "overlay.png").stat().st_size > 10_000
     (line,) = read_results(tmp_path / "a" / "results.csv")
     assert line.score > 0
+
+    # Another picture's result in the same folder would replace this one.
+    with pytest.raises(SystemExit):
+        run_app(monkeypatch, "estimate", *arguments, "box=[1,2,30,40]", f"hydra.run.dir={tmp_path / 'a'}")
+    assert "holds a run with other settings" in capsys.readouterr().err
 
     rows, columns = torch.nonzero(scene.mask, as_tuple=True)
     box = [

@@ -1,4 +1,5 @@
 import copy
+import warnings
 
 import pytest
 import torch
@@ -120,6 +121,23 @@ def test_alone_as_in_a_batch_with_other_objects(scene, oracle_blob, oracle_onboa
     assert not alone[2].valid[0]
     angle, _ = errors(batch, torch.cat([T_other, T_true[:1], T_true[:1], T_true[1:]]))
     assert angle[[0, 1, 3]].max() < 2.0
+
+
+def test_other_settings_than_the_objects_are_warned_of_once(scene, oracle_blob):
+    image, masks, _ = scene
+    pipeline = make_pipeline(
+        retriever=TemplateRetriever(SoftAssignBow(sigma=3.0)), crop=PerspectiveCrop(fill=0.5)
+    )
+    with torch.no_grad():
+        with pytest.warns(UserWarning, match="retrieval suffers") as caught:
+            pipeline(image[None], K[None], oracle_blob, masks=masks[:1])
+        assert ["fill=0.6" in str(w.message) or "sigma=10.0" in str(w.message) for w in caught] == [
+            True,
+            True,
+        ]
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            pipeline(image[None], K[None], oracle_blob, masks=masks[:1])
 
 
 def test_boxes_in_place_of_masks(scene, oracle_blob):

@@ -347,3 +347,23 @@ def test_bad_shapes() -> None:
         RansacPnp()(torch.zeros(5, 2), torch.zeros(5, 3), torch.eye(3))
     with pytest.raises(ValueError, match=r"valid must have shape \(1, 5\), got \(5,\)"):
         RansacPnp()(torch.zeros(1, 5, 2), torch.zeros(1, 5, 3), torch.eye(3)[None], torch.ones(5))
+
+
+def test_points_behind_the_camera_are_flagged() -> None:
+    """Pixels of points that lie behind the camera: some sets fit no pose in front of it."""
+    K = torch.tensor([[800.0, 0.0, 200.0], [0.0, 800.0, 200.0], [0.0, 0.0, 1.0]])
+    generator = torch.Generator().manual_seed(0)
+    model = torch.randn(40, 4, 3, generator=generator) * 50
+    camera = model + torch.tensor([10.0, 20.0, -120.0])
+    pixels = (camera / camera[..., 2:] @ K.T)[..., :2]
+    result = RansacPnp(min_inliers=4)(pixels, model, K.expand(40, 3, 3))
+    behind = result.status == PnpStatus.BEHIND_CAMERA
+    assert behind.sum() >= 3
+    assert (result.num_inliers[behind] == 0).all()
+    assert not result.success[behind].any()
+    assert torch.isfinite(result.T_camera_from_model).all()
+    # Whatever is called a pose has its inliers in front of the camera and on their pixels.
+    placed = model @ result.T_camera_from_model[:, :3, :3].mT + result.T_camera_from_model[:, None, :3, 3]
+    assert (placed[..., 2][result.inliers] > 0).all()
+    projected = (placed / placed[..., 2:] @ K.T)[..., :2]
+    assert (torch.linalg.vector_norm(projected - pixels, dim=-1)[result.inliers] < 10.0).all()
