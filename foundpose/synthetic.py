@@ -53,7 +53,7 @@ def procedural_mesh(seed: int, diameter: float = 120.0, subdivisions: int = 6) -
         phase = torch.rand(count, generator=generator, dtype=torch.float64) * 2 * math.pi
         return torch.cos(directions @ k + phase).mean(dim=1) * math.sqrt(2 * count)
 
-    radius = 1.0 + 0.16 * waves(12, 2.0) + 0.04 * waves(24, 5.0)
+    radius = 1.0 + 0.10 * waves(12, 2.0) + 0.02 * waves(24, 5.0)
     stretch = 0.6 + 0.5 * torch.rand(3, generator=generator, dtype=torch.float64)
     vertices = directions * radius.clamp(min=0.4)[:, None] * stretch
     extent = (vertices.amax(0) - vertices.amin(0)).max()
@@ -108,9 +108,9 @@ def cluttered_scene(
 
     focal = 0.95 * width
     K = intrinsics_matrix(focal, focal, width / 2 - 0.5 + uniform(-9, 9), height / 2 - 0.5 + uniform(-9, 9))
-    # The object takes about a third of the picture's height.
-    distance = mesh.diameter * focal / (0.36 * height) * uniform(0.85, 1.25)
-    pixel = torch.tensor([[width * uniform(0.3, 0.7), height * uniform(0.3, 0.7)]])
+    # The object takes about half of the picture's height.
+    distance = mesh.diameter * focal / (0.5 * height) * uniform(0.85, 1.25)
+    pixel = torch.tensor([[width * uniform(0.3, 0.7), height * uniform(0.35, 0.65)]])
     R = random_rotation(generator)
     centre = (mesh.bounds[0] + mesh.bounds[1]).double() / 2
     t = (pixel_rays(pixel, K)[0] * distance).double() - R @ centre

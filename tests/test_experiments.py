@@ -37,7 +37,7 @@ def own_picture(tmp_path_factory):
     """A photograph, a mask and a mesh as files, and the truth."""
     folder = tmp_path_factory.mktemp("own")
     mesh = procedural_mesh(1, subdivisions=5)
-    scene = cluttered_scene(mesh, seed=31)
+    scene = cluttered_scene(mesh, seed=51)
     write_ply(folder / "cup.ply", mesh)
     pixels = (scene.image * 255).round().byte().permute(1, 2, 0).numpy()
     Image.fromarray(pixels).save(folder / "photo.png")

@@ -15,8 +15,8 @@ def test_the_python_example_runs(tmp_path, monkeypatch, capsys):
     (code,) = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
     statements = [line for line in code.splitlines() if line and not line.startswith(("import", "from"))]
     assert len(statements) <= 10
-    mesh = procedural_mesh(5, subdivisions=5)
-    scene = cluttered_scene(mesh, seed=5)
+    mesh = procedural_mesh(1, subdivisions=5)
+    scene = cluttered_scene(mesh, seed=51)
     write_ply(tmp_path / "cup.ply", mesh)
     Image.fromarray((scene.image * 255).round().byte().permute(1, 2, 0).numpy()).save(tmp_path / "photo.png")
     Image.fromarray(scene.mask.numpy()).save(tmp_path / "mask.png")

@@ -15,6 +15,7 @@ from foundpose.rendering import Mesh, Renderer
 from foundpose.visualization.overlay import COARSE, TRUTH, draw_axes, draw_contour
 
 _MOST_LINES = 60
+_MOST_TEMPLATES = 7
 
 
 def overlay_pose(
@@ -84,7 +85,8 @@ def save_estimate_figure(
         e.crops.images[index].cpu(), e.crops.masks[index].cpu() > 0.5, (1.0, 1.0, 1.0), width=1
     )
     _show(right, crop, "crop and mask")
-    for rank, axes in enumerate(middle.subplots(1, len(templates), squeeze=False)[0]):
+    shown = sorted({*range(min(len(templates), _MOST_TEMPLATES)), best})
+    for rank, axes in zip(shown, middle.subplots(1, len(shown), squeeze=False)[0], strict=True):
         inliers = int(e.hypotheses.num_inliers[index, rank])
         similarity = float(e.templates.similarity[index, rank])
         _show(axes, views[rank], f"{similarity:.2f}, {inliers} inliers" + (" (best)" if rank == best else ""))
