@@ -21,10 +21,10 @@ from tqdm import tqdm
 
 from foundpose.bop import BopDataset, Instance, PoseResult, read_image, read_mask, write_results
 from foundpose.config import Method, build_method, claim_run_folder, clear_errors, wanted_objects
+from foundpose.estimates import PoseEstimates, PoseStatus
 from foundpose.geometry import boxes_from_xywh, intrinsics_matrix, masks_from_boxes
 from foundpose.io import write_atomically
 from foundpose.onboarding import ObjectRepresentation
-from foundpose.pipeline import PoseEstimates, PoseStatus
 from foundpose.progress import ProgressBars
 from foundpose.rendering import Mesh, load_mesh
 from foundpose.timing import StageTimer

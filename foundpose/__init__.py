@@ -1,10 +1,11 @@
 """6D pose of unseen objects from one RGB image: FoundPose (ECCV 2024) as differentiable, batched modules."""
 
+from foundpose.estimates import PoseEstimates, PoseStatus
 from foundpose.features import DenseSift, DinoV2, FeatureHook, PatchExtractor, PcaProjection
 from foundpose.geometry import PerspectiveCrop, SphereInplane, SuperFibonacci
 from foundpose.matching import PatchMatcher
 from foundpose.onboarding import ObjectRepresentation, Onboarder, RepresentationStore
-from foundpose.pipeline import FoundPose, PoseEstimates, PoseStatus
+from foundpose.pipeline import FoundPose
 from foundpose.pnp import RansacPnp
 from foundpose.rendering import Mesh, PyrenderRenderer, RaycastRenderer, load_mesh
 from foundpose.retrieval import SoftAssignBow, TemplateRetriever, VisualWords

@@ -2,98 +2,21 @@
 
 import warnings
 from collections.abc import Callable, Sequence
-from enum import IntEnum
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from foundpose.estimates import Correspondences, PoseEstimates, PoseHypotheses, PoseStatus
 from foundpose.features.base import Fingerprint, PatchExtractor, PatchFeatures
 from foundpose.geometry import Crops, PerspectiveCrop, invert_transform
 from foundpose.matching import PatchMatcher
 from foundpose.onboarding import ObjectRepresentation, RepresentationInfo
-from foundpose.pnp import PnpStatus, RansacPnp
+from foundpose.pnp import RansacPnp
 from foundpose.retrieval import QueryPatches, RetrievedTemplates, TemplateRetriever
 
 _Fields = TypeVar("_Fields", bound=tuple[Any, ...])
-
-
-class PoseStatus(IntEnum):
-    """Why a crop has no pose. The codes of :class:`PnpStatus` keep their values."""
-
-    OK = PnpStatus.OK
-    TOO_FEW_CORRESPONDENCES = PnpStatus.TOO_FEW_CORRESPONDENCES
-    DEGENERATE = PnpStatus.DEGENERATE
-    BEHIND_CAMERA = PnpStatus.BEHIND_CAMERA
-    TOO_FEW_INLIERS = PnpStatus.TOO_FEW_INLIERS
-    UNUSABLE_MASK = 100
-    NO_PATCHES = 101
-
-
-class Correspondences(NamedTuple):
-    """2D-3D correspondences of B crops with h retrieved templates each.
-
-    Attributes:
-        points_image: (B, P, 2) patch centres in the crop, pixels.
-        points_model: (B, h, P, 3) matched points, mesh units.
-        pixels_template: (B, h, P, 2) centres of the matched template patches, pixels of the template.
-        distance: (B, h, P) descriptor distances, +inf where not valid.
-        valid: (B, h, P) bool.
-    """
-
-    points_image: Tensor
-    points_model: Tensor
-    pixels_template: Tensor
-    distance: Tensor
-    valid: Tensor
-
-
-class PoseHypotheses(NamedTuple):
-    """One pose for each crop and retrieved template.
-
-    Attributes:
-        T_crop_from_model: (B, h, 4, 4), mesh units.
-        inliers: (B, h, P) bool.
-        num_inliers: (B, h).
-        status: (B, h) codes of :class:`PoseStatus`.
-    """
-
-    T_crop_from_model: Tensor
-    inliers: Tensor
-    num_inliers: Tensor
-    status: Tensor
-
-
-class PoseEstimates(NamedTuple):
-    """Poses of a batch of crops, and what they were made from.
-
-    Attributes:
-        T_camera_from_model: (B, 4, 4), mesh units; finite but meaningless where not valid.
-        score: (B,) share of the crop's patches that are inliers, in [0, 1].
-        num_inliers: (B,) inlier correspondences, the quality by which the best of h hypotheses is chosen.
-        valid: (B,) bool, a pose with at least the fewest inliers that the PnP stage asks for. It is no confidence:
-            noise can reach that many by chance. Judge by ``score``.
-        status: (B,) codes of :class:`PoseStatus`.
-        best: (B,) which hypothesis was chosen.
-        crops: the perspective crops.
-        query: the crops' patches.
-        templates: the retrieved templates.
-        correspondences: the matches.
-        hypotheses: the poses of all retrieved templates.
-    """
-
-    T_camera_from_model: Tensor
-    score: Tensor
-    num_inliers: Tensor
-    valid: Tensor
-    status: Tensor
-    best: Tensor
-    crops: Crops
-    query: QueryPatches
-    templates: RetrievedTemplates
-    correspondences: Correspondences
-    hypotheses: PoseHypotheses
 
 
 class _ExtractorChecks:

@@ -8,9 +8,9 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from foundpose.estimates import PoseEstimates, PoseStatus
 from foundpose.io import write_atomically
 from foundpose.onboarding import ObjectRepresentation
-from foundpose.pipeline import PoseEstimates, PoseStatus
 from foundpose.rendering import Mesh, Renderer
 from foundpose.visualization.overlay import COARSE, TRUTH, draw_axes, draw_contour
 
