@@ -90,7 +90,8 @@ def estimate_picture(cfg: DictConfig, output: Path) -> None:
 
 def numbers(cfg: DictConfig, name: str, form: str, count: int | None = None) -> list[float]:
     """A list of numbers of the config."""
-    value = OmegaConf.to_container(cfg)[name]  # type: ignore[index,call-overload]
+    node = cfg[name]
+    value = list(node) if OmegaConf.is_list(node) else node
     right = isinstance(value, list) and all(isinstance(v, int | float) for v in value)
     if not right or count not in (None, len(value)):
         raise ValueError(f"{name} must be {form}, got {value}")

@@ -198,7 +198,7 @@ def _architecture(variant: str, config: Mapping[str, ConfigValue] | None) -> Din
     unknown = set(config or {}) - set(DinoV2Architecture._fields)
     if unknown:
         raise ValueError(f"config has unknown keys {sorted(unknown)}; known: {DinoV2Architecture._fields}")
-    architecture = VARIANTS[variant]._replace(**(config or {}))  # type: ignore[arg-type]
+    architecture = VARIANTS[variant]._replace(**(config or {}))  # type: ignore[arg-type]  # fields of several types
     if bool(architecture.num_register_tokens) != variant.endswith("_reg"):
         raise ValueError(f"{variant} cannot have {architecture.num_register_tokens} register tokens")
     return architecture

@@ -60,7 +60,7 @@ def test_equals_brute_force(mode: str, top_k: int | None) -> None:
     inputs = problem()
     inputs[1][1] = False  # a crop without patches
     inputs[3][2, 1] = False  # a template without patches
-    got = PatchMatcher(mode, top_k)(*inputs)  # type: ignore[arg-type]
+    got = PatchMatcher(mode, top_k)(*inputs)
     assert_same(got, brute_force(inputs, mode == "cyclic", top_k))
     assert not got.valid[1].any()
     assert not got.valid[2, 1].any()
@@ -115,7 +115,7 @@ def test_keep_best_is_lexicographic() -> None:
 )
 def test_padding_and_batch_do_not_matter(seed: int, mode: str, top_k: int | None) -> None:
     query, query_valid, template, template_valid, pixels = problem(seed=seed)
-    matcher = PatchMatcher(mode, top_k)  # type: ignore[arg-type]
+    matcher = PatchMatcher(mode, top_k)
     expected = matcher(query, query_valid, template, template_valid, pixels)
     far = 1e3
     padded = matcher(
@@ -191,6 +191,6 @@ def test_bad_input() -> None:
     with pytest.raises(ValueError, match=r"query_pixels must have shape \(3, 30, 2\)"):
         matcher(query, query_valid, template, template_valid, pixels[..., :1])
     with pytest.raises(ValueError, match="got 'mutual'"):
-        PatchMatcher("mutual")  # type: ignore[arg-type]
+        PatchMatcher("mutual")
     with pytest.raises(ValueError, match="top_k must be at least 1 or None, got 0"):
         PatchMatcher(top_k=0)

@@ -170,9 +170,9 @@ def test_point_cloud_and_empty_mesh(tmp_path: Path) -> None:
 
 
 def write_off(path: Path, vertices: object, faces: object) -> Path:
-    body = [f"{len(vertices)} {len(faces)} 0"]  # type: ignore[arg-type]
-    body += [" ".join(map(str, v)) for v in vertices]  # type: ignore[attr-defined]
-    body += ["3 " + " ".join(map(str, f)) for f in faces]  # type: ignore[attr-defined]
+    body = [f"{len(vertices)} {len(faces)} 0"]
+    body += [" ".join(map(str, v)) for v in vertices]
+    body += ["3 " + " ".join(map(str, f)) for f in faces]
     path.write_text("OFF\n" + "\n".join(body) + "\n")
     return path
 

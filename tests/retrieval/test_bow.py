@@ -97,7 +97,7 @@ def test_idf_of_occurrences_is_the_papers_formula() -> None:
     np.testing.assert_allclose(idf.numpy(), [math.log(12 / n) if n > 0 else 0.0 for n in total.tolist()])
     assert (idf < 0).any()
     with pytest.raises(ValueError, match="'document' or 'occurrence', got 'log'"):
-        inverse_document_frequency(assignment, valid, 20, mode="log")  # type: ignore[arg-type]
+        inverse_document_frequency(assignment, valid, 20, mode="log")
 
 
 def test_word_in_every_template_weighs_nothing() -> None:
