@@ -6,7 +6,7 @@ from typing import NamedTuple
 from torch import Tensor
 
 from foundpose.geometry import Crops
-from foundpose.pnp import PnpStatus
+from foundpose.pnp import PnpStatus, PoseCandidates
 from foundpose.retrieval import QueryPatches, RetrievedTemplates
 
 
@@ -30,6 +30,7 @@ class Correspondences(NamedTuple):
         points_model: (B, h, P, 3) matched points, mesh units.
         pixels_template: (B, h, P, 2) centres of the matched template patches, pixels of the template.
         distance: (B, h, P) descriptor distances, +inf where not valid.
+        weight: (B, h, P) confidences in (0, 1], 0 where not valid.
         valid: (B, h, P) bool.
     """
 
@@ -37,6 +38,7 @@ class Correspondences(NamedTuple):
     points_model: Tensor
     pixels_template: Tensor
     distance: Tensor
+    weight: Tensor
     valid: Tensor
 
 
@@ -72,6 +74,8 @@ class PoseEstimates(NamedTuple):
         templates: the retrieved templates.
         correspondences: the matches.
         hypotheses: the poses of all retrieved templates.
+        candidates: with a soft selection in the PnP stage, the hypotheses of all templates and samples with the
+            probability of choosing each (``T_camera_from_model`` (B, h · J, 4, 4)); None without.
     """
 
     T_camera_from_model: Tensor
@@ -85,3 +89,4 @@ class PoseEstimates(NamedTuple):
     templates: RetrievedTemplates
     correspondences: Correspondences
     hypotheses: PoseHypotheses
+    candidates: PoseCandidates | None = None

@@ -11,9 +11,10 @@ from torch import Tensor, nn
 from foundpose.estimates import Correspondences, PoseEstimates, PoseHypotheses, PoseStatus
 from foundpose.features.base import Fingerprint, PatchExtractor, PatchFeatures
 from foundpose.geometry import Crops, PerspectiveCrop, invert_transform
-from foundpose.matching import PatchMatcher
+from foundpose.matching import PatchMatcher, SoftPatchMatcher
 from foundpose.onboarding import ObjectRepresentation, RepresentationInfo
-from foundpose.pnp import RansacPnp
+from foundpose.pnp import PoseCandidates, RansacPnp
+from foundpose.pnp.soft_selection import choose_softly
 from foundpose.retrieval import QueryPatches, RetrievedTemplates, TemplateRetriever
 
 _Fields = TypeVar("_Fields", bound=tuple[Any, ...])
@@ -61,7 +62,7 @@ class FoundPose(nn.Module):
         crop: PerspectiveCrop,
         extractor: PatchExtractor,
         retriever: TemplateRetriever,
-        matcher: PatchMatcher,
+        matcher: PatchMatcher | SoftPatchMatcher,
         pnp: RansacPnp,
     ) -> None:
         super().__init__()
@@ -97,9 +98,13 @@ class FoundPose(nn.Module):
             ValueError: shapes that do not fit, or an object that was onboarded with another extractor or size
                 (looked at when an object is first given).
 
-        Differentiable w.r.t. ``images``, ``K``, ``boxes`` and the extractor's parameters as far as the stages
-        are: crop, descriptors, similarities and descriptor distances are; the choice of templates, of matches
-        and of RANSAC samples is constant.
+        Differentiable w.r.t. ``images``, ``K``, ``boxes``, the extractor's parameters and the objects' buffers as far
+        as the stages are. The poses depend on the descriptors through the matches' weights and (soft matching) 3D
+        points: use :class:`SoftPatchMatcher`, or :class:`PatchMatcher` with a ``confidence_temperature``; with equal
+        weights a hard match changes by jumps only, and the poses depend on the image by no gradient but through the
+        crop's camera. The choice of templates, matches, RANSAC samples, inliers and of the best hypothesis is
+        constant; ``candidates`` (soft selection in :class:`RansacPnp`) has a gradient in that choice. The object's
+        templates are constants: they do not follow an extractor that is being trained.
         """
         objects = [objects] if isinstance(objects, ObjectRepresentation) else list(objects)
         self._check_objects(objects)
@@ -112,8 +117,8 @@ class FoundPose(nn.Module):
         with torch.autocast(crops.images.device.type, enabled=False):
             raw = select_query_patches(features, crops, self.extractor)
             query, templates, correspondences = self._match(objects, members, raw)
-            hypotheses = self._solve(correspondences, crops.K_crop)
-            return _choose(crops, query, templates, correspondences, hypotheses)
+            hypotheses, candidates = self._solve(correspondences, crops)
+            return _choose(crops, query, templates, correspondences, hypotheses, candidates)
 
     def _check_objects(self, objects: list[ObjectRepresentation]) -> None:
         if not objects:
@@ -170,33 +175,48 @@ class FoundPose(nn.Module):
         patches = representation.gather_templates(templates.index)
         template_valid = patches.valid & templates.valid.unsqueeze(-1)
         matches = self.matcher(
-            query.descriptors, query.valid, patches.descriptors, template_valid, query.pixels
+            query.descriptors,
+            query.valid,
+            patches.descriptors,
+            template_valid,
+            query.pixels,
+            patches.points_model,
         )
         chosen = matches.template_patch.unsqueeze(-1)
         correspondences = Correspondences(
             points_image=query.pixels,
-            points_model=patches.points_model.gather(2, chosen.expand(-1, -1, -1, 3)).to(query.pixels),
+            points_model=matches.points_model.to(query.pixels),
             pixels_template=patches.pixels.gather(2, chosen.expand(-1, -1, -1, 2)).to(query.pixels),
             distance=matches.distance,
+            weight=matches.weight.to(query.pixels),
             valid=matches.valid,
         )
         return query, templates, correspondences
 
-    def _solve(self, correspondences: Correspondences, K_crop: Tensor) -> PoseHypotheses:
+    def _solve(
+        self, correspondences: Correspondences, crops: Crops
+    ) -> tuple[PoseHypotheses, PoseCandidates | None]:
         """PnP for all crops and templates as one batch."""
         B, h, P = correspondences.valid.shape
         result = self.pnp(
             correspondences.points_image.unsqueeze(1).expand(-1, h, -1, -1).reshape(B * h, P, 2),
             correspondences.points_model.reshape(B * h, P, 3),
-            K_crop.unsqueeze(1).expand(-1, h, -1, -1).reshape(B * h, 3, 3),
+            crops.K_crop.unsqueeze(1).expand(-1, h, -1, -1).reshape(B * h, 3, 3),
             correspondences.valid.reshape(B * h, P),
+            correspondences.weight.reshape(B * h, P),
         )
-        return PoseHypotheses(
+        hypotheses = PoseHypotheses(
             T_crop_from_model=result.T_camera_from_model.reshape(B, h, 4, 4),
             inliers=result.inliers.reshape(B, h, P),
             num_inliers=result.num_inliers.reshape(B, h),
             status=result.status.reshape(B, h),
         )
+        if result.candidates is None or self.pnp.soft_selection is None:
+            return hypotheses, None
+        # One choice among the candidates of all templates of a crop, in place of one for each template.
+        T, score, _, valid = (x.unflatten(0, (B, h)).flatten(1, 2) for x in result.candidates)
+        T = invert_transform(crops.T_crop_from_camera).unsqueeze(1) @ T
+        return hypotheses, choose_softly(T, score, valid, self.pnp.soft_selection.temperature)
 
 
 def select_query_patches(features: PatchFeatures, crops: Crops, extractor: PatchExtractor) -> QueryPatches:
@@ -238,6 +258,7 @@ def _choose(
     templates: RetrievedTemplates,
     correspondences: Correspondences,
     hypotheses: PoseHypotheses,
+    candidates: PoseCandidates | None,
 ) -> PoseEstimates:
     """Keep the hypothesis with the most inliers; of equal ones, that of the more similar template."""
     B, h = hypotheses.num_inliers.shape
@@ -264,6 +285,7 @@ def _choose(
         templates=templates,
         correspondences=correspondences,
         hypotheses=hypotheses,
+        candidates=candidates,
     )
 
 

@@ -15,9 +15,10 @@ from foundpose.geometry import (
     pixel_rays,
     rotation_angle,
 )
-from foundpose.matching import PatchMatcher
+from foundpose.losses import PointMatchingLoss
+from foundpose.matching import PatchMatcher, SoftPatchMatcher
 from foundpose.onboarding import Onboarder
-from foundpose.pnp import RansacPnp
+from foundpose.pnp import GaussNewtonPnp, RansacPnp, SoftInlierSelection
 from foundpose.rendering import CoordinateRenderer, RaycastRenderer
 from foundpose.rendering.coordinates import render_coordinate_image
 from foundpose.retrieval import SoftAssignBow, TemplateRetriever, VisualWords
@@ -250,15 +251,20 @@ def test_bad_input(scene, oracle_blob):
         pipeline(image[None], K[None], oracle_blob, masks=masks[:0], image_index=index[:0])
 
 
-def test_a_vision_transformer_takes_the_place_of_the_oracle(blob):
-    """The whole path with DINOv2's architecture (small, random weights): it runs, and gradients reach the weights."""
+def small_transformer(blob, seed=0):
+    """A small DINOv2 with random weights, an object onboarded with it, and a picture."""
     size = {"hidden_size": 48, "num_attention_heads": 3, "num_hidden_layers": 2}
-    extractor = DinoV2.random_init("vits14_reg", layer=1, seed=0, config=size)
+    extractor = DinoV2.random_init("vits14_reg", layer=1, seed=seed, config=size)
     bow = SoftAssignBow(sigma=1.0)
     onboarder = Onboarder(
         RaycastRenderer(), extractor, SuperFibonacci(20), VisualWords(50), bow, projection=PcaProjection(32)
     )
-    representation = onboarder(blob, "blob")
+    return extractor, bow, onboarder(blob, "blob")
+
+
+def test_a_vision_transformer_takes_the_place_of_the_oracle(blob):
+    """The whole path with DINOv2's architecture (small, random weights): it runs, and gradients reach the weights."""
+    extractor, bow, representation = small_transformer(blob)
     assert representation.template_cls.shape == (20, 48)
     picture = cluttered_scene(blob, seed=3)
     pipeline = make_pipeline(extractor, retriever=TemplateRetriever(bow, num_templates=3))
@@ -267,6 +273,50 @@ def test_a_vision_transformer_takes_the_place_of_the_oracle(blob):
     assert torch.isfinite(e.T_camera_from_model).all()
     assert e.query.cls.shape == (1, 48)
     (e.correspondences.distance[e.correspondences.valid].mean() - e.templates.similarity.sum()).backward()
-    gradients = [p.grad for p in extractor.parameters() if p.grad is not None]
-    assert sum(g.abs().sum() for g in gradients) > 0
-    assert all(torch.isfinite(g).all() for g in gradients)
+    assert_useful_gradients(extractor)
+
+
+def assert_useful_gradients(module):
+    gradients = {name: p.grad for name, p in module.named_parameters() if p.grad is not None}
+    assert len(gradients) > 10
+    assert all(torch.isfinite(g).all() for g in gradients.values())
+    # Weights, not only biases of the last layer, at both ends of the network.
+    for part in ("patch_embeddings", "layer.0.", "layer.1."):
+        assert any(part in name and g.abs().max() > 0 for name, g in gradients.items()), part
+
+
+@pytest.mark.parametrize("differentiation", ["implicit", "unrolled"])
+@pytest.mark.parametrize(
+    "matcher",
+    [PatchMatcher(confidence_temperature=0.3), SoftPatchMatcher(0.3)],
+    ids=["hard", "soft"],
+)
+@pytest.mark.parametrize("soft_selection", [None, SoftInlierSelection(4)], ids=["hard_choice", "soft_choice"])
+def test_a_loss_on_the_pose_reaches_the_extractor(blob, matcher, soft_selection, differentiation):
+    extractor, bow, representation = small_transformer(blob)
+    # A template as picture: random features recognise it, so there are inliers enough.
+    T, intrinsics = representation.T_template_from_model[3], representation.K_template[3]
+    render = RaycastRenderer()(blob, T[None], intrinsics[None], (420, 420))
+    image = render.rgb * 0.9 + 0.02
+    pipeline = make_pipeline(
+        extractor,
+        retriever=TemplateRetriever(bow, num_templates=3),
+        matcher=matcher,
+        pnp=RansacPnp(polish=GaussNewtonPnp(differentiation=differentiation), soft_selection=soft_selection),
+    )
+    e = pipeline(image, intrinsics[None], representation, masks=render.mask)
+    assert e.valid.all()
+    loss = PointMatchingLoss("l2")
+    points = blob.hull_vertices
+    if soft_selection is None:
+        assert e.candidates is None
+        value = loss(e.T_camera_from_model, T[None], points).sum()
+    else:
+        assert e.candidates.T_camera_from_model.shape == (1, 12, 4, 4)
+        poses = e.candidates.T_camera_from_model.flatten(0, 1)
+        losses = loss(poses, T.expand(12, 4, 4), points).unflatten(0, (1, 12))
+        torch.testing.assert_close(e.candidates.probability.sum(1), torch.ones(1))
+        value = e.candidates.expected(losses).sum()
+    assert value > 0
+    value.backward()
+    assert_useful_gradients(extractor)

@@ -161,7 +161,8 @@ def describe_windows(windows: Tensor, descriptor: nn.Module, contrast: float) ->
         contrast: standard deviation at which a descriptor has half its length; 0 for none.
 
     Returns:
-        (N, 128). Differentiable w.r.t. ``windows``; the gradient of a flat window is zero.
+        (N, 128). Differentiable w.r.t. ``windows``; the gradient of a flat window is zero. With a contrast of 0
+        the gradient of a nearly flat window is finite but grows as the window's contrast falls.
     """
     described = descriptor(windows.unsqueeze(1))
     centred = windows - windows.mean(dim=(-2, -1), keepdim=True)

@@ -27,7 +27,8 @@ class FeatureHook(nn.Module):
     Raises:
         ValueError: ``layer`` is no submodule of ``module``.
 
-    Differentiable w.r.t. the inputs and the parameters up to the layer.
+    Differentiable w.r.t. the inputs and the parameters up to the layer; parameters that are frozen stay so, and
+    the graph is the module's own.
     """
 
     def __init__(self, module: nn.Module, layer: str | nn.Module, stop: bool = True) -> None:

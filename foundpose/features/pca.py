@@ -96,6 +96,8 @@ def principal_components(covariance: Tensor, num_components: int) -> tuple[Tenso
 
     Raises:
         ValueError: If the covariance is not finite or zero.
+
+    Differentiable w.r.t. ``covariance`` where its eigenvalues differ.
     """
     channels = covariance.shape[0]
     if covariance.shape != (channels, channels):
@@ -122,7 +124,8 @@ class PcaProjection(nn.Module):
     """Projection of descriptors to the leading principal components, without whitening.
 
     Until it is fitted (or a state dict is loaded) the buffers are empty. They keep the module's floating-point
-    type and device, so ``.double()`` or ``.to(device)`` before fitting holds afterwards.
+    type and device, so ``.double()`` or ``.to(device)`` before fitting holds afterwards. They are constants for
+    autograd, whatever they were fitted to; :meth:`make_trainable` turns mean and components into parameters.
 
     Args:
         num_components: number d of components.
@@ -171,6 +174,27 @@ class PcaProjection(nn.Module):
         """Projection from a mean (C,) and a covariance (C, C)."""
         return cls(num_components)._set(mean, covariance)
 
+    def make_trainable(self) -> Self:
+        """Turn ``mean`` and ``components`` into parameters, for an optimiser to find in ``parameters()``.
+
+        The state dict keeps its names; loading it into another projection gives buffers there, and so does
+        fitting. Nothing keeps trained components orthonormal. What was made with the components before (words and
+        descriptors of an ``ObjectRepresentation``) does not follow them.
+
+        Returns:
+            The projection itself.
+
+        Raises:
+            RuntimeError: Before the projection is fitted.
+        """
+        self._check_fitted()
+        for name in ("mean", "components"):
+            value = getattr(self, name)
+            if not isinstance(value, nn.Parameter):
+                delattr(self, name)
+                setattr(self, name, nn.Parameter(value.detach()))
+        return self
+
     def forward(self, x: Tensor) -> Tensor:
         """Project descriptors.
 
@@ -184,10 +208,9 @@ class PcaProjection(nn.Module):
             RuntimeError: Before the projection is fitted.
             ValueError: If the descriptors have another length.
 
-        Differentiable w.r.t. ``x``, and w.r.t. the buffers if the caller sets ``requires_grad`` on them.
+        Differentiable w.r.t. ``x``, and after :meth:`make_trainable` w.r.t. ``mean`` and ``components``.
         """
-        if not self.is_fitted:
-            raise RuntimeError("PcaProjection is not fitted: call fit() or load a state dict first")
+        self._check_fitted()
         if x.shape[-1] != self.mean.shape[0]:
             raise ValueError(f"x must have shape (..., {self.mean.shape[0]}), got {tuple(x.shape)}")
         return (x - self.mean) @ self.components.T
@@ -203,11 +226,17 @@ class PcaProjection(nn.Module):
                 f"mean and covariance must have shapes (C,) and (C, C), got {tuple(mean.shape)} and "
                 f"{tuple(covariance.shape)}"
             )
-        components, variances = principal_components(covariance, self.num_components)
-        self.components = components.to(self.components)
-        self.explained_variance = variances.to(self.explained_variance)
-        self.mean = mean.detach().clone().to(self.mean)
+        components, variances = principal_components(covariance.detach(), self.num_components)
+        fitted = {"mean": mean.detach().clone(), "components": components, "explained_variance": variances}
+        for name, value in fitted.items():
+            value = value.to(getattr(self, name).detach())
+            delattr(self, name)  # it may be a parameter
+            self.register_buffer(name, value)
         return self
+
+    def _check_fitted(self) -> None:
+        if not self.is_fitted:
+            raise RuntimeError("PcaProjection is not fitted: call fit() or load a state dict first")
 
     def _load_from_state_dict(
         self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any

@@ -13,6 +13,15 @@ from foundpose.geometry.cameras import (
     unproject_pixels,
 )
 from foundpose.geometry.crop import Crops, PerspectiveCrop
+from foundpose.geometry.symmetries import (
+    Symmetries,
+    axis_rotation,
+    discretise,
+    nearest_axis_angles,
+    no_symmetries,
+    stack_symmetries,
+    symmetries_from_models_info,
+)
 from foundpose.geometry.transforms import (
     invert_transform,
     make_transform,
@@ -33,15 +42,20 @@ __all__ = [
     "PerspectiveCrop",
     "SphereInplane",
     "SuperFibonacci",
+    "Symmetries",
+    "axis_rotation",
     "axis_rotation_to_ray",
     "boxes_from_masks",
     "boxes_from_points",
     "boxes_from_xywh",
     "camera_on_boxes",
+    "discretise",
     "intrinsics_matrix",
     "invert_transform",
     "make_transform",
     "masks_from_boxes",
+    "nearest_axis_angles",
+    "no_symmetries",
     "pixel_grid",
     "pixel_rays",
     "project_points",
@@ -51,7 +65,9 @@ __all__ = [
     "se3_exp",
     "shift_intrinsics",
     "sphere_inplane_rotations",
+    "stack_symmetries",
     "super_fibonacci_rotations",
+    "symmetries_from_models_info",
     "transform_points",
     "unproject_pixels",
 ]

@@ -14,7 +14,7 @@ def boxes_from_masks(masks: Tensor) -> tuple[Tensor, Tensor]:
 
     Returns:
         Boxes (B, 4) float32 as pixel edges and a flag (B,) that is False for an empty mask, whose box is the
-        whole image.
+        whole image. Not differentiable: boxes jump from pixel to pixel.
     """
     if masks.dim() != 3:
         raise ValueError(f"masks must have shape (B, H, W), got {tuple(masks.shape)}")
@@ -43,13 +43,16 @@ def boxes_from_points(pixels: Tensor) -> Tensor:
 
 
 def boxes_from_xywh(xywh: Tensor) -> Tensor:
-    """Boxes of pixels ``[x, y, width, height]`` (first column, first row, number of columns and rows) as edges."""
+    """Boxes of pixels ``[x, y, width, height]`` (first column, first row, number of columns and rows) as edges.
+
+    Differentiable w.r.t. ``xywh``.
+    """
     x, y, w, h = xywh.unbind(-1)
     return torch.stack([x - 0.5, y - 0.5, x + w - 0.5, y + h - 0.5], dim=-1)
 
 
 def masks_from_boxes(boxes: Tensor, height: int, width: int) -> Tensor:
-    """Masks (B, H, W) bool of the pixels whose centres lie in the boxes (B, 4)."""
+    """Masks (B, H, W) bool of the pixels whose centres lie in the boxes (B, 4). Not differentiable."""
     u = torch.arange(width, device=boxes.device, dtype=boxes.dtype)
     v = torch.arange(height, device=boxes.device, dtype=boxes.dtype)
     inside_u = (u >= boxes[:, 0, None]) & (u <= boxes[:, 2, None])

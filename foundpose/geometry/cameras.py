@@ -15,7 +15,7 @@ def project_points(points_camera: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
         Pixel coordinates (..., N, 2) and depths (..., N). Where the depth is not positive the pixel is finite
         but means nothing: test the depth.
 
-    Differentiable w.r.t. both arguments.
+    Differentiable w.r.t. both arguments (depths of about zero are held fixed, so that the gradient is finite).
     """
     depth = points_camera[..., 2]
     tiny = torch.finfo(depth.dtype).eps
@@ -39,7 +39,10 @@ def pixel_rays(pixels: Tensor, K: Tensor) -> Tensor:
 
 
 def unproject_pixels(pixels: Tensor, depth: Tensor, K: Tensor) -> Tensor:
-    """Lift pixels (..., N, 2) with depths (..., N) (z, not distance) to points (..., N, 3) in the camera frame."""
+    """Lift pixels (..., N, 2) with depths (..., N) (z, not distance) to points (..., N, 3) in the camera frame.
+
+    Differentiable w.r.t. all arguments.
+    """
     return pixel_rays(pixels, K) * depth.unsqueeze(-1)
 
 
@@ -54,14 +57,20 @@ def pixel_grid(height: int, width: int, device: torch.device, dtype: torch.dtype
 
 
 def shift_intrinsics(K: Tensor, left_top: Tensor) -> Tensor:
-    """Intrinsics after cutting pixels off: (..., 3, 3) and (..., 2) → (..., 3, 3), ``c' = c - left_top``."""
+    """Intrinsics after cutting pixels off: (..., 3, 3) and (..., 2) → (..., 3, 3), ``c' = c - left_top``.
+
+    Differentiable w.r.t. both arguments.
+    """
     shift = torch.zeros_like(K)
     shift[..., :2, 2] = left_top
     return K - shift
 
 
 def resize_intrinsics(K: Tensor, scale: float) -> Tensor:
-    """Intrinsics after resizing the image by ``scale``: ``f' = s f``, ``c' = (c + 0.5) s - 0.5``."""
+    """Intrinsics after resizing the image by ``scale``: ``f' = s f``, ``c' = (c + 0.5) s - 0.5``.
+
+    Differentiable w.r.t. ``K``.
+    """
     scaling = torch.tensor(
         [[scale, 0.0, 0.5 * scale - 0.5], [0.0, scale, 0.5 * scale - 0.5], [0.0, 0.0, 1.0]],
         device=K.device,
@@ -109,7 +118,8 @@ def camera_on_boxes(boxes: Tensor, K: Tensor, size: int, fill: float) -> tuple[T
         fill: δ, the share of the side that the box takes.
 
     Returns:
-        ``K_crop`` (B, 3, 3) and ``T_crop_from_camera`` (B, 4, 4). Differentiable w.r.t. ``boxes`` and ``K``.
+        ``K_crop`` (B, 3, 3) and ``T_crop_from_camera`` (B, 4, 4). Differentiable w.r.t. ``boxes`` and ``K`` (where
+        width and height tie for the longer side, half of either's gradient).
     """
     left, top, right, bottom = boxes.unbind(-1)
     corners = torch.stack(

@@ -23,7 +23,7 @@ class Crops(NamedTuple):
         boxes: (B, 4) boxes in the image that the crops are focused on, pixel edges.
         valid: (B,) False for a mask that is empty or smaller than ``min_box_size``, for a box that is degenerate
             or outside its image, and for intrinsics that are no camera's. Such a crop shows the whole image, its
-            mask is zero.
+            mask is zero, and all of it is constant for autograd.
     """
 
     images: Tensor
@@ -84,7 +84,8 @@ class PerspectiveCrop(nn.Module):
         Raises:
             ValueError: shapes or values that do not fit.
 
-        Differentiable w.r.t. ``images``, ``K`` and ``boxes`` (the pyramid level is held fixed).
+        Differentiable w.r.t. ``images``, ``K`` and ``boxes``. The crops' masks, and boxes that are found from
+        masks, are constants; to differentiate a soft mask, pass it through :func:`warp_images`.
         """
         image_index = _check_inputs(images, K, masks, boxes, image_index)
         # Half precision and autocast move pixels: cameras and warps are computed in single precision at least.
@@ -98,24 +99,26 @@ class PerspectiveCrop(nn.Module):
         self, images: Tensor, K: Tensor, masks: Tensor | None, boxes: Tensor | None, image_index: Tensor
     ) -> Crops:
         height, width = images.shape[-2:]
-        K, is_camera = _usable_intrinsics(K)
+        K, is_camera = _usable_intrinsics(K, height, width)
         if masks is not None:
             mask_boxes, occupied = boxes_from_masks(masks)
             boxes = mask_boxes.to(K) if boxes is None else boxes
         else:
             assert boxes is not None
             occupied = torch.ones(len(boxes), dtype=torch.bool, device=boxes.device)
-        boxes, valid = _usable_boxes(boxes, height, width, self.min_box_size)
-        valid = valid & occupied & is_camera[image_index]
+        usable = occupied & is_camera[image_index]
+        boxes, valid = _usable_boxes(boxes, usable, height, width, self.min_box_size)
 
         K_camera = K[image_index]
+        K_camera = torch.where(valid[:, None, None], K_camera, K_camera.detach())
         K_crop, T_crop_from_camera = camera_on_boxes(boxes, K_camera, self.size, self.fill)
         homographies = K_crop @ T_crop_from_camera[:, :3, :3] @ torch.linalg.inv(K_camera)
         levels = torch.zeros(len(boxes), device=images.device, dtype=images.dtype)
         if self.antialias:
-            shrink = (K_camera[:, [0, 1], [0, 1]].abs().amax(1) / K_crop[:, 0, 0]).detach()
+            shrink = K_camera[:, [0, 1], [0, 1]].amax(1) / K_crop[:, 0, 0]
             levels = shrink.clamp(min=1.0).log2()
         crops = warp_images(images, homographies, image_index, levels, self.size)
+        crops = torch.where(valid[:, None, None, None], crops, crops.detach())
         region = masks_from_boxes(boxes.detach(), height, width) if masks is None else masks != 0
         region = (region & valid[:, None, None]).to(images.dtype)
         crop_masks = warp_perspective(
@@ -137,7 +140,7 @@ def warp_images(
         size: side of the crops.
 
     Returns:
-        (B, C, size, size). Differentiable w.r.t. ``images`` and ``homographies``.
+        (B, C, size, size). Differentiable w.r.t. ``images``, ``homographies`` and ``levels``.
     """
     height, width = images.shape[-2:]
     top_level = int(math.log2(min(height, width))) - 1
@@ -166,18 +169,24 @@ def warp_images(
     return out
 
 
-def _usable_intrinsics(K: Tensor) -> tuple[Tensor, Tensor]:
-    """Replace intrinsics (N, 3, 3) that are no pinhole camera's; say which ones were usable."""
+def _usable_intrinsics(K: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
+    """Replace intrinsics (N, 3, 3) that are no pinhole camera's by a common camera's; say which ones were usable."""
     focal = K[:, [0, 1], [0, 1]]
     bottom = K.new_tensor([0.0, 0.0, 1.0])
     usable = torch.isfinite(K).all(dim=(1, 2)) & (focal > 0).all(dim=1) & (K[:, 2] == bottom).all(dim=1)
-    return torch.where(usable[:, None, None], K, torch.eye(3, device=K.device, dtype=K.dtype)), usable
+    focal_length = float(max(height, width))
+    common = K.new_tensor(
+        [[focal_length, 0.0, (width - 1) / 2], [0.0, focal_length, (height - 1) / 2], [0.0, 0.0, 1.0]]
+    )
+    return torch.where(usable[:, None, None], K, common), usable
 
 
-def _usable_boxes(boxes: Tensor, height: int, width: int, min_size: float) -> tuple[Tensor, Tensor]:
-    """Replace boxes that cannot be cropped by the whole image; say which ones were usable."""
+def _usable_boxes(
+    boxes: Tensor, usable: Tensor, height: int, width: int, min_size: float
+) -> tuple[Tensor, Tensor]:
+    """Replace boxes that are not usable or cannot be cropped by the whole image; say which ones are left."""
     left, top, right, bottom = boxes.unbind(-1)
-    valid = torch.isfinite(boxes).all(dim=-1) & (right > left) & (bottom > top)
+    valid = usable & torch.isfinite(boxes).all(dim=-1) & (right > left) & (bottom > top)
     valid &= torch.maximum(right - left, bottom - top) >= min_size
     valid &= (right > -0.5) & (left < width - 0.5) & (bottom > -0.5) & (top < height - 0.5)
     whole = boxes.new_tensor([-0.5, -0.5, width - 0.5, height - 0.5])

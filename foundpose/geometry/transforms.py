@@ -5,7 +5,7 @@
 """
 
 import torch
-from kornia.geometry.liegroup import Se3
+from kornia.geometry.liegroup import So3
 from torch import Tensor
 
 
@@ -50,19 +50,21 @@ def transform_points(T_b_from_a: Tensor, points_a: Tensor) -> Tensor:
 def se3_exp(twist: Tensor) -> Tensor:
     """Exponential map of SE(3): twists (..., 6) as ``(v, ω)`` → (..., 4, 4).
 
-    Differentiable w.r.t. ``twist`` everywhere, the identity included (kornia's ``Se3``).
+    Differentiable w.r.t. ``twist`` everywhere, the identity included, in reverse and forward mode.
     """
     if twist.shape[-1] != 6:
         raise ValueError(f"twist must have shape (..., 6), got {tuple(twist.shape)}")
-    T = Se3.exp(twist.reshape(-1, 6)).matrix().reshape(*twist.shape[:-1], 4, 4)
-    # kornia wraps a plain translation as a Parameter; constants must stay constants.
-    return T if twist.requires_grad else T.detach()
+    v, w = twist.reshape(-1, 6).split(3, dim=-1)
+    # Not kornia's Se3: it wraps a translation without history as a Parameter, which loses forward-mode tangents.
+    t = So3.left_jacobian(w) @ v.unsqueeze(-1)
+    return make_transform(So3.exp(w).matrix(), t.squeeze(-1)).reshape(*twist.shape[:-1], 4, 4)
 
 
 def rotation_angle(R_a: Tensor, R_b: Tensor) -> Tensor:
     """Geodesic distance between rotations: two (..., 3, 3) → (...) in radians, accurate near 0 and π.
 
-    Differentiable w.r.t. both arguments where they differ (the distance has a kink at zero).
+    Differentiable w.r.t. both arguments; at its kinks, 0 and π, the gradient is a finite subgradient (zero where
+    the product of the rotations is exactly symmetric).
     """
     R = R_a.transpose(-1, -2) @ R_b
     axis = torch.stack(
@@ -74,9 +76,21 @@ def rotation_angle(R_a: Tensor, R_b: Tensor) -> Tensor:
 def project_to_rotation(M: Tensor) -> Tensor:
     """Nearest rotation in the Frobenius norm: (..., 3, 3) → (..., 3, 3), determinant +1.
 
-    Differentiable w.r.t. ``M`` where its singular values differ.
+    Differentiable (once) w.r.t. ``M`` wherever the nearest rotation is unique, so at rotations too. Elsewhere
+    (rank below two, or a negative determinant and two equal smallest singular values) directions in which the
+    rotation is not determined have gradient zero.
     """
-    U, _, Vh = torch.linalg.svd(M)
+    # Autograd of the SVD is NaN where singular values are equal, as they are for a rotation.
+    U, S, Vh = torch.linalg.svd(M.detach())
     sign = torch.det(U @ Vh).sign()
     flip = torch.stack([torch.ones_like(sign), torch.ones_like(sign), sign], dim=-1)
-    return (U * flip.unsqueeze(-2)) @ Vh
+    U, S = U * flip.unsqueeze(-2), S * flip
+    if not M.requires_grad:
+        return U @ Vh
+    # With M = U S Vᵀ the rotation U Vᵀ turns by U Ω Vᵀ, Ω_ij = (Uᵀ dM V - (Uᵀ dM V)ᵀ)_ij / (s_i + s_j).
+    inner = U.transpose(-1, -2) @ M @ Vh.transpose(-1, -2)
+    total = S.unsqueeze(-1) + S.unsqueeze(-2)
+    smallest = 8.0 * torch.finfo(S.dtype).eps * S[..., :1, None]
+    turn = (inner - inner.transpose(-1, -2)) / total.where(total > smallest, torch.inf)
+    # The value is zero but for rounding; only its derivative is wanted.
+    return U @ Vh + U @ (turn - turn.detach()) @ Vh

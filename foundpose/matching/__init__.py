@@ -2,5 +2,6 @@
 
 from foundpose.matching.base import Matches
 from foundpose.matching.matcher import PatchMatcher
+from foundpose.matching.soft import SoftPatchMatcher
 
-__all__ = ["Matches", "PatchMatcher"]
+__all__ = ["Matches", "PatchMatcher", "SoftPatchMatcher"]

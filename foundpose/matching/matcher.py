@@ -5,7 +5,8 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from foundpose.matching.base import Matches
+from foundpose.matching.base import Matches, check_patches
+from foundpose.matching.soft import check_temperature, match_probabilities, point_confidence, point_moments
 
 MatchingMode = Literal["nearest", "cyclic"]
 
@@ -69,7 +70,9 @@ def match_patches(
     template: Tensor,
     template_valid: Tensor,
     query_pixels: Tensor | None,
+    template_points: Tensor,
     top_k: int | None,
+    temperature: float | None = None,
 ) -> Matches:
     """Match B crops to h templates each; shapes as in `PatchMatcher.forward`.
 
@@ -79,27 +82,31 @@ def match_patches(
         template: (B, h, Q, d), finite.
         template_valid: (B, h, Q) bool.
         query_pixels: (B, P, 2) to rank matches by cycle distance, or None.
+        template_points: (B, h, Q, 3), finite.
         top_k: number of matches to keep per template, or None for all.
+        temperature: of the confidences, or None for ones.
 
     Returns:
-        The matches. Differentiable w.r.t. the descriptors through the distances.
+        The matches. Differentiable w.r.t. the descriptors through distances and weights, and w.r.t. the points.
     """
     B, h, Q = template_valid.shape
     P = query.shape[1]
     if min(B, h, P, Q) == 0:
         nothing = query_valid.new_zeros(B, h, P)
-        return Matches(nothing.long(), query.new_full((B, h, P), torch.inf), nothing)
-    pairs = max(1, _DISTANCES_PER_BLOCK // (P * Q))
+        zero = query.new_zeros(B, h, P)
+        return Matches(nothing.long(), zero + torch.inf, nothing, template_points.new_zeros(B, h, P, 3), zero)
     template, template_valid = template.flatten(0, 1), template_valid.flatten(0, 1)
+    points = template_points.flatten(0, 1)
     crop = torch.arange(B * h, device=query.device) // h
-    patch, distance, valid = [], [], []
-    for start in range(0, B * h, pairs):
-        block = slice(start, start + pairs)
-        q, q_valid, t, t_valid = (
-            query[crop[block]],
-            query_valid[crop[block]],
+    blocks = []
+    for block in torch.arange(B * h, device=query.device).split(max(1, _DISTANCES_PER_BLOCK // (P * Q))):
+        mine = crop[block]
+        q, q_valid, t, t_valid, x = (
+            query[mine],
+            query_valid[mine],
             template[block],
             template_valid[block],
+            points[block],
         )
         forth, back = nearest_patches(q, q_valid, t, t_valid, query_pixels is not None)
         ok = q_valid & t_valid.any(dim=1, keepdim=True)
@@ -109,15 +116,27 @@ def match_patches(
         if top_k is not None:
             cycle = None
             if query_pixels is not None and back is not None:
-                pixels = query_pixels[crop[block]]
+                pixels = query_pixels[mine]
                 cycle = torch.linalg.vector_norm(
                     pixels - pixels.gather(1, back.unsqueeze(-1).expand_as(pixels)), dim=-1
                 )
             ok = keep_best(ok, cycle, length, top_k)
-        patch.append(forth.masked_fill(~ok, 0))
-        distance.append(length.masked_fill(~ok, torch.inf))
-        valid.append(ok)
-    return Matches(*(torch.cat(parts).unflatten(0, (B, h)) for parts in (patch, distance, valid)))
+        chosen = x.gather(1, forth.unsqueeze(-1).expand(-1, -1, 3))
+        if temperature is None:
+            weight = torch.ones_like(length)
+        else:
+            probability = match_probabilities(q, t, t_valid, temperature)
+            weight = point_confidence(point_moments(probability, x, chosen)[1], x, t_valid)
+        blocks.append(
+            Matches(
+                forth.masked_fill(~ok, 0),
+                length.masked_fill(~ok, torch.inf),
+                ok,
+                chosen.masked_fill(~ok.unsqueeze(-1), 0.0),
+                weight.masked_fill(~ok, 0.0),
+            )
+        )
+    return Matches(*(torch.cat(parts).unflatten(0, (B, h)) for parts in zip(*blocks, strict=True)))
 
 
 class PatchMatcher(nn.Module):
@@ -128,18 +147,29 @@ class PatchMatcher(nn.Module):
             in the crop between a patch and the patch to which the template's patch matches back.
         top_k: keep this many matches per template, the best first by cycle distance (in mode "cyclic"), then by
             descriptor distance, then by index; None keeps all, and then both modes give the same.
+        confidence_temperature: gives each match the confidence that :class:`SoftPatchMatcher` has at this temperature
+            that the patch lies where it was matched to, so that a pose estimated from the weighted matches has a
+            gradient in the descriptors. None: all matches weigh the same (the paper), and a pose has none.
 
     Source: paper, "Crop-to-template patch matching"; cyclic: Goodwin et al., ECCV 2022.
     """
 
-    def __init__(self, mode: MatchingMode = "nearest", top_k: int | None = None) -> None:
+    def __init__(
+        self,
+        mode: MatchingMode = "nearest",
+        top_k: int | None = None,
+        confidence_temperature: float | None = None,
+    ) -> None:
         super().__init__()
         if mode not in ("nearest", "cyclic"):
             raise ValueError(f"mode must be 'nearest' or 'cyclic', got {mode!r}")
         if top_k is not None and top_k < 1:
             raise ValueError(f"top_k must be at least 1 or None, got {top_k}")
+        if confidence_temperature is not None:
+            check_temperature(confidence_temperature)
         self.mode = mode
         self.top_k = top_k
+        self.confidence_temperature = confidence_temperature
 
     def forward(
         self,
@@ -148,6 +178,7 @@ class PatchMatcher(nn.Module):
         template_descriptors: Tensor,
         template_valid: Tensor,
         query_pixels: Tensor,
+        template_points: Tensor,
     ) -> Matches:
         """Match B crops with h templates each.
 
@@ -157,6 +188,7 @@ class PatchMatcher(nn.Module):
             template_descriptors: (B, h, Q, d).
             template_valid: (B, h, Q) bool.
             query_pixels: (B, P, 2) patch centres in the crop, pixels (read in mode "cyclic" only).
+            template_points: (B, h, Q, 3) the template patches' points, mesh units.
 
         Returns:
             One match per crop patch and template; not valid where the patch is not, where the template has no
@@ -166,39 +198,28 @@ class PatchMatcher(nn.Module):
         Raises:
             ValueError: If shapes do not fit.
 
-        Differentiable w.r.t. the descriptors through ``distance``; the choice of patches is constant.
+        Differentiable w.r.t. the descriptors through ``distance`` and (with a ``confidence_temperature``) ``weight``,
+        and w.r.t. ``template_points``; the choice of patches is constant.
         """
-        _check_shapes(query_descriptors, query_valid, template_descriptors, template_valid, query_pixels)
+        check_patches(
+            query_descriptors,
+            query_valid,
+            template_descriptors,
+            template_valid,
+            query_pixels,
+            template_points,
+        )
         return match_patches(
             query_descriptors,
             query_valid,
             template_descriptors,
             template_valid,
             query_pixels if self.mode == "cyclic" else None,
+            template_points,
             self.top_k,
+            self.confidence_temperature,
         )
 
     def extra_repr(self) -> str:
         """Settings, for printing."""
-        return f"mode={self.mode!r}, top_k={self.top_k}"
-
-
-def _check_shapes(
-    query: Tensor, query_valid: Tensor, template: Tensor, template_valid: Tensor, pixels: Tensor
-) -> None:
-    fits = query.ndim == 3 and template.ndim == 4
-    if not (fits and template.shape[0] == query.shape[0] and template.shape[3] == query.shape[2]):
-        raise ValueError(
-            "descriptors must have shapes (B, P, d) for crops and (B, h, Q, d) for templates, got "
-            f"{tuple(query.shape)} and {tuple(template.shape)}"
-        )
-    for name, mask, expected in (
-        ("query_valid", query_valid, query.shape[:2]),
-        ("template_valid", template_valid, template.shape[:3]),
-    ):
-        if mask.shape != expected or mask.dtype != torch.bool:
-            raise ValueError(
-                f"{name} must be bool of shape {tuple(expected)}, got {tuple(mask.shape)} {mask.dtype}"
-            )
-    if pixels.shape != (*query.shape[:2], 2):
-        raise ValueError(f"query_pixels must have shape {(*query.shape[:2], 2)}, got {tuple(pixels.shape)}")
+        return f"mode={self.mode!r}, top_k={self.top_k}, confidence_temperature={self.confidence_temperature}"

@@ -81,7 +81,8 @@ def levenberg_marquardt(
         ValueError: ``T`` is not (B, 4, 4) or a setting is out of range.
 
     Differentiable w.r.t. ``T`` and whatever ``evaluate`` closes over, through the steps taken (unrolled); which
-    steps are kept, and the damping, count as constants.
+    steps are kept, and the damping factors, count as constants. For the gradient of the optimum itself see
+    :func:`~foundpose.optimization.attach_implicit_gradient`.
 
     Source: Marquardt, "An algorithm for least-squares estimation of nonlinear parameters", 1963.
     """
@@ -137,7 +138,7 @@ def _solve(H: Tensor, g: Tensor, damping: Tensor) -> tuple[Tensor, Tensor]:
     g = torch.where(usable[:, None], g, torch.zeros_like(g))
     diagonal = H.diagonal(dim1=-2, dim2=-1)
     smallest = torch.finfo(H.dtype).eps * diagonal.amax(-1, keepdim=True)
-    scaling = diagonal.clamp(min=smallest).detach()
+    scaling = torch.maximum(diagonal, smallest)
     # Solving in the scaled variables keeps the condition number free of the units.
     root = scaling.sqrt()
     scaled = H / (root[:, :, None] * root[:, None, :]) + torch.diag_embed(damping[:, None].expand_as(root))

@@ -11,12 +11,21 @@ class RobustLoss(Protocol):
     """A loss ρ(s) of the squared residual s with ρ(0) = 0 and ρ'(0) = 1, so that it is s near zero.
 
     The cost of a set of residuals r is ``½ Σ ρ(r²)``; its Gauss-Newton system is that of ordinary least
-    squares with each residual weighted by ρ'.
+    squares with each residual weighted by ρ', the weight of iteratively reweighted least squares (IRLS).
     """
 
     def __call__(self, squared: Tensor) -> tuple[Tensor, Tensor]:
         """Return ρ and its derivative ρ', both in the shape of ``squared``."""
         ...
+
+
+@dataclass(frozen=True)
+class LeastSquares:
+    """No robustness: ρ(s) = s. Differentiable w.r.t. the squared residual."""
+
+    def __call__(self, squared: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the squared residuals as they are, and ones."""
+        return squared, torch.ones_like(squared)
 
 
 @dataclass(frozen=True)

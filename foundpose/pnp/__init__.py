@@ -1,7 +1,23 @@
-"""Perspective-n-Point: minimal solvers, RANSAC and polish."""
+"""Perspective-n-Point: minimal solvers, RANSAC, differentiable polish."""
 
 from foundpose.pnp.epnp import MinimalSolution, solve_epnp
+from foundpose.pnp.gauss_newton import GaussNewtonPnp, PnpOptimum
+from foundpose.pnp.p3p import P3PSolutions, solve_p3p
 from foundpose.pnp.polish import polish_pnp
 from foundpose.pnp.ransac import PnpResult, PnpStatus, RansacPnp
+from foundpose.pnp.soft_selection import PoseCandidates, SoftInlierSelection
 
-__all__ = ["MinimalSolution", "PnpResult", "PnpStatus", "RansacPnp", "polish_pnp", "solve_epnp"]
+__all__ = [
+    "GaussNewtonPnp",
+    "MinimalSolution",
+    "P3PSolutions",
+    "PnpOptimum",
+    "PnpResult",
+    "PnpStatus",
+    "PoseCandidates",
+    "RansacPnp",
+    "SoftInlierSelection",
+    "polish_pnp",
+    "solve_epnp",
+    "solve_p3p",
+]

@@ -1,15 +1,62 @@
 """Polish of poses by minimising the reprojection error."""
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
 from foundpose.geometry.transforms import make_transform, transform_points
-from foundpose.optimization.levenberg_marquardt import (
+from foundpose.optimization import (
+    Differentiation,
     LevenbergMarquardtResult,
     NormalEquations,
-    levenberg_marquardt,
+    RobustLoss,
+    attach_implicit_gradient,
+    optimise_pose,
 )
-from foundpose.optimization.robust import RobustLoss
+
+
+class LocalFrame(NamedTuple):
+    """The frame that a pose is optimised in: ``x_camera = origin + size * (T_local @ x_local)``.
+
+    It sits at the object's centroid in units of the object's size, where rotation and translation hardly couple; in
+    the camera frame a narrow field of view leaves float32 few digits.
+
+    Attributes:
+        centroid: (B, 3) weighted mean of the model points, mesh units.
+        size: (B, 1) root mean square distance from it, mesh units.
+        origin: (B, 3) the centroid in the camera frame at the initial pose, mesh units.
+    """
+
+    centroid: Tensor
+    size: Tensor
+    origin: Tensor
+
+    @classmethod
+    def at(cls, T: Tensor, points_model: Tensor, weights: Tensor) -> "LocalFrame":
+        """Frame of weighted points (B, N, 3) at poses (B, 4, 4)."""
+        total = weights.sum(-1, keepdim=True).clamp(min=torch.finfo(weights.dtype).tiny)
+        centroid = (weights.unsqueeze(-1) * points_model).sum(-2) / total
+        centred = points_model - centroid.unsqueeze(-2)
+        # Its value only scales the problem, so it has no gradient.
+        variance = (weights * centred.square().sum(-1)).sum(-1, keepdim=True).detach() / total.detach()
+        size = torch.where(variance > 0, variance, torch.ones_like(variance)).sqrt()
+        origin = transform_points(T, centroid.unsqueeze(-2)).squeeze(-2)
+        return cls(centroid, size, origin)
+
+    def pose_to_local(self, T: Tensor) -> Tensor:
+        """``T_local`` of the pose that the frame was made at: a pure rotation."""
+        return make_transform(T[:, :3, :3], torch.zeros_like(self.origin))
+
+    def pose_from_local(self, T_local: Tensor) -> Tensor:
+        """``T_camera_from_model`` of a pose in this frame."""
+        R = T_local[:, :3, :3]
+        t = self.origin + self.size * T_local[:, :3, 3] - (R @ self.centroid.unsqueeze(-1)).squeeze(-1)
+        return make_transform(R, t)
+
+    def points(self, points_model: Tensor) -> Tensor:
+        """Model points (B, N, 3) in units of this frame."""
+        return (points_model - self.centroid.unsqueeze(-2)) / self.size.unsqueeze(-1)
 
 
 def polish_pnp(
@@ -21,66 +68,105 @@ def polish_pnp(
     *,
     loss: RobustLoss | None = None,
     max_iterations: int = 10,
-) -> LevenbergMarquardtResult:
+    tolerance: float | None = None,
+    differentiation: Differentiation = "implicit",
+) -> tuple[LevenbergMarquardtResult, LocalFrame]:
     """Minimise ``½ Σ w ρ(‖π(K, T x) − u‖²)`` over the pose, one problem per batch element.
-
-    The optimisation runs in a frame at the object's centroid in units of the object's size, where rotation and
-    translation hardly couple: in the camera frame a narrow field of view leaves float32 few digits.
 
     Args:
         T_camera_from_model: (B, 4, 4) initial poses with every weighted point in front of the camera.
         points_image: (B, N, 2) pixels.
         points_model: (B, N, 3) mesh units.
         K: (B, 3, 3) intrinsics.
-        weights: (B, N) non-negative; a bool mask works too. None means all ones. Points of weight zero must
-            be finite but are ignored.
+        weights: (B, N) non-negative; a bool mask works too. None means all ones. Points of weight zero are ignored,
+            whatever they are.
         loss: ρ on squared pixel distances; None means least squares.
         max_iterations: Levenberg-Marquardt iterations.
+        tolerance: relative decrease of the cost that counts as converged; None means a few units of rounding.
+        differentiation: gradient of the optimum ("implicit") or of the steps taken ("unrolled").
 
     Returns:
-        A :class:`~foundpose.optimization.LevenbergMarquardtResult`; its costs are in px². A sample whose
-        initial pose has a weighted point behind the camera, or that has no weighted point, comes back as it
-        was with ``failed`` set. ``H`` belongs to twists in the frame that the optimisation runs in.
+        A :class:`~foundpose.optimization.LevenbergMarquardtResult` with costs in px², and the frame that its ``H``
+        belongs to. A sample whose initial pose has a weighted point behind the camera, that has no weighted point, or
+        any number in which is not finite, comes back as it was with ``failed`` set and without a gradient.
 
     Raises:
-        ValueError: shapes do not fit.
+        ValueError: shapes do not fit, or an unknown mode of differentiation.
 
-    Differentiable w.r.t. all tensors, through the steps taken (unrolled).
+    Differentiable w.r.t. ``points_image``, ``points_model``, ``K`` and ``weights``, and in mode "unrolled" w.r.t.
+    the initial poses. The weight of a point that is left out (zero) has no gradient.
 
     Source: paper, section "Pose estimation from 2D-3D correspondences".
     """
     check_correspondences(points_image, points_model, K, weights)
-    if weights is None:
-        weights = torch.ones_like(points_image[..., 0])
-    weights = weights.to(points_image.dtype)
-
-    total = weights.sum(-1, keepdim=True).clamp(min=torch.finfo(weights.dtype).tiny)
-    centroid = (weights.unsqueeze(-1) * points_model).sum(-2) / total
-    centred = points_model - centroid.unsqueeze(-2)
-    # Root mean square distance from the centroid; its value only scales the problem, so it has no gradient.
-    variance = (weights * centred.square().sum(-1)).sum(-1, keepdim=True).detach() / total.detach()
-    size = torch.where(variance > 0, variance, torch.ones_like(variance)).sqrt()
-    points_local = centred / size.unsqueeze(-1)
-    # x_camera = origin + size * (T_local @ x_local), with T_local a pure rotation at the start.
-    R = T_camera_from_model[:, :3, :3]
-    origin = transform_points(T_camera_from_model, centroid.unsqueeze(-2)).squeeze(-2)
+    weights = unit_weights(points_image) if weights is None else weights.to(points_image.dtype)
+    finite = usable_coordinates(points_image) & usable_coordinates(points_model)
+    sane = torch.isfinite(T_camera_from_model).all(-1).all(-1) & torch.isfinite(K).all(-1).all(-1)
+    sane = sane & (torch.isfinite(weights) & (finite | (weights == 0))).all(-1)
+    # Stand-ins without weight, which fail: no NaN may enter the graph, not even multiplied by zero.
+    given, T_camera_from_model = T_camera_from_model, _where(sane, T_camera_from_model, 4)
+    K = _where(sane, K, 3)
+    weights = weights.masked_fill(~(sane.unsqueeze(-1) & (weights > 0)), 0.0)
+    points_image = points_image.masked_fill((weights == 0).unsqueeze(-1), 0.0)
+    points_model = points_model.masked_fill((weights == 0).unsqueeze(-1), 0.0)
+    if differentiation == "implicit":
+        # The optimum does not depend on the frame that it is looked for in, nor on where the search begins.
+        T_camera_from_model = T_camera_from_model.detach()
+        frame = LocalFrame.at(T_camera_from_model, points_model.detach(), weights.detach())
+    else:
+        frame = LocalFrame.at(T_camera_from_model, points_model, weights)
+    points_local = frame.points(points_model)
 
     def evaluate(T_local: Tensor) -> NormalEquations:
-        return reprojection_equations(
-            T_local, points_local, points_image, K, weights, origin=origin, size=size, loss=loss
-        )
+        return reprojection_equations(T_local, points_local, points_image, K, weights, frame, loss)
 
     # Pixel coordinates carry rounding errors of a few units in their last place.
     rounding = 8.0 * torch.finfo(points_image.dtype).eps * K.detach().abs().amax((-1, -2))
-    result = levenberg_marquardt(
+    result = optimise_pose(
         evaluate,
-        make_transform(R, torch.zeros_like(origin)),
+        frame.pose_to_local(T_camera_from_model),
+        differentiation=differentiation,
         max_iterations=max_iterations,
+        tolerance=tolerance,
         floor=weights.detach().sum(-1) * rounding.square(),
     )
-    R = result.T[:, :3, :3]
-    t = origin + size * result.T[:, :3, 3] - (R @ centroid.unsqueeze(-1)).squeeze(-1)
-    return result._replace(T=make_transform(R, t))
+    T = torch.where(sane[:, None, None], frame.pose_from_local(result.T), given)
+    return result._replace(T=T), frame
+
+
+def attach_pnp_gradient(
+    T_camera_from_model: Tensor,
+    points_image: Tensor,
+    points_model: Tensor,
+    K: Tensor,
+    weights: Tensor,
+    loss: RobustLoss | None = None,
+) -> Tensor:
+    """Poses that minimise the reprojection error, with the gradient of that optimum; see :func:`polish_pnp`.
+
+    The values do not change by a single bit. Poses without a well-conditioned optimum have a gradient of zero.
+    """
+    T = T_camera_from_model.detach()
+    weights = weights.to(points_image.dtype)
+    frame = LocalFrame.at(T, points_model.detach(), weights.detach())
+    points_local = frame.points(points_model)
+    optimum = attach_implicit_gradient(
+        lambda T_local: reprojection_equations(T_local, points_local, points_image, K, weights, frame, loss),
+        frame.pose_to_local(T),
+    )
+    attached = frame.pose_from_local(optimum.T)
+    return T + (attached - attached.detach())
+
+
+def _where(sane: Tensor, matrices: Tensor, size: int) -> Tensor:
+    """Identity matrices in place of those that are not sane."""
+    identity = torch.eye(size, dtype=matrices.dtype, device=matrices.device)
+    return torch.where(sane[:, None, None], matrices, identity)
+
+
+def unit_weights(points_image: Tensor) -> Tensor:
+    """Weights of one for points (B, N, 2)."""
+    return torch.ones_like(points_image[..., 0])
 
 
 def reprojection_equations(
@@ -89,12 +175,10 @@ def reprojection_equations(
     points_image: Tensor,
     K: Tensor,
     weights: Tensor,
-    *,
-    origin: Tensor,
-    size: Tensor,
+    frame: LocalFrame,
     loss: RobustLoss | None = None,
 ) -> NormalEquations:
-    """Linearise the reprojection error of ``origin + size * (T_local @ points_local)``.
+    """Linearise the reprojection error of ``frame.origin + frame.size * (T_local @ points_local)``.
 
     Args:
         T_local: (B, 4, 4).
@@ -102,8 +186,7 @@ def reprojection_equations(
         points_image: (B, N, 2) pixels.
         K: (B, 3, 3) intrinsics.
         weights: (B, N).
-        origin: (B, 3) origin of the local frame in the camera frame, mesh units.
-        size: (B, 1) mesh units per unit of the local frame.
+        frame: where the local frame lies.
         loss: ρ on squared pixel distances; None means least squares.
 
     Returns:
@@ -111,7 +194,7 @@ def reprojection_equations(
         lies behind the camera. Differentiable w.r.t. all tensors.
     """
     rotated = transform_points(T_local, points_local)
-    points_camera = origin.unsqueeze(-2) + size.unsqueeze(-1) * rotated
+    points_camera = frame.origin.unsqueeze(-2) + frame.size.unsqueeze(-1) * rotated
     x, y, depth = points_camera.unbind(-1)
     in_front = depth > 0
     inverse = 1.0 / torch.where(in_front, depth, torch.ones_like(depth))
@@ -128,7 +211,7 @@ def reprojection_equations(
     # d plane / d points_camera, then d points_camera / d δ = size [I, −[rotated]×].
     zero = torch.zeros_like(inverse)
     columns = [inverse, zero, -plane[..., 0] * inverse, zero, inverse, -plane[..., 1] * inverse]
-    by_point = focal @ torch.stack(columns, dim=-1).unflatten(-1, (2, 3)) * size[..., None, None]
+    by_point = focal @ torch.stack(columns, dim=-1).unflatten(-1, (2, 3)) * frame.size[..., None, None]
     by_rotation = torch.linalg.cross(rotated.unsqueeze(-2).expand_as(by_point), by_point, dim=-1)
     J = torch.cat([by_point, by_rotation], dim=-1)
     share = torch.where(used & in_front, weights * slope, zero)

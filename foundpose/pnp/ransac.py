@@ -1,6 +1,5 @@
-"""RANSAC around the minimal solver, for a batch of Perspective-n-Point problems."""
+"""RANSAC around a minimal solver, for a batch of Perspective-n-Point problems."""
 
-import math
 from enum import IntEnum
 from typing import NamedTuple
 
@@ -9,12 +8,12 @@ from torch import Tensor, nn
 
 from foundpose.geometry.cameras import pixel_rays
 from foundpose.geometry.transforms import make_transform
-from foundpose.optimization.robust import RobustLoss
-from foundpose.pnp.epnp import solve_epnp_minimal
-from foundpose.pnp.polish import check_correspondences, polish_pnp, usable_coordinates
-from foundpose.pnp.scoring import reprojection_errors, score_poses, select_inliers
-
-_SAMPLE = 4
+from foundpose.pnp.gauss_newton import GaussNewtonPnp
+from foundpose.pnp.polish import check_correspondences, usable_coordinates
+from foundpose.pnp.sampling import SAMPLE_SIZE, Hypotheses, SolverName, check_solver, sample_hypotheses
+from foundpose.pnp.scoring import reprojection_errors, select_inliers
+from foundpose.pnp.soft_selection import PoseCandidates, SoftInlierSelection
+from foundpose.pnp.weak_perspective import mirrored_poses
 
 
 class PnpStatus(IntEnum):
@@ -45,6 +44,7 @@ class PnpResult(NamedTuple):
         success: (B,) bool, ``status`` is OK.
         status: (B,) int64, values of :class:`PnpStatus`.
         reprojection_rmse: (B,) root mean square distance of the inliers in pixels; infinite without inliers.
+        candidates: the hypotheses of a soft selection, or None without one.
     """
 
     T_camera_from_model: Tensor
@@ -53,23 +53,30 @@ class PnpResult(NamedTuple):
     success: Tensor
     status: Tensor
     reprojection_rmse: Tensor
+    candidates: PoseCandidates | None = None
 
 
 class RansacPnp(nn.Module):
-    """Robust pose from 2D-3D correspondences: EPnP on minimal samples, inlier count, polish on the inliers.
+    """Robust pose from 2D-3D correspondences: minimal samples, inlier count, polish on the inliers.
 
     A problem's random samples depend on the seed and on its own number of valid correspondences only, and all
     decisions are made per problem: neighbours, padding, batch size and device do not change a result.
 
     Args:
-        iterations: samples of four correspondences drawn for each problem.
+        solver: minimal solver on samples of four: "p3p" on three of them with the fourth to choose the root, or
+            "epnp" (the paper's).
+        iterations: samples drawn for each problem.
         threshold: largest distance of an inlier's projection from its pixel, in pixels.
         min_inliers: poses with fewer inliers are flagged. (Four points always fit themselves.)
         confidence: stop a problem's sampling once an all-inlier sample has been drawn with this probability,
             judged by the best inlier ratio so far; None draws all samples.
         polish_rounds: how often the inliers are selected anew and the pose polished on them.
-        polish_iterations: Levenberg-Marquardt iterations in each round.
-        loss: robust loss of the polish on squared pixel distances; None means least squares.
+        mirror: also polish each pose's mirror image in depth and keep the better one: the projections of a flat
+            object hardly tell the two apart, and samples often fall for the wrong one.
+        polish: how; it decides on the robust loss and on the kind of gradient. None means
+            ``GaussNewtonPnp(max_iterations=10)``.
+        soft_selection: also return the best hypotheses with the probability of choosing them, for losses on the
+            expected pose error (DSAC). The pose returned is the same as without.
         seed: seed of the samples.
         chunk: samples solved and scored at once; bounds the memory to about 30 · B · chunk · N numbers, and
             sampling stops at its multiples.
@@ -82,44 +89,51 @@ class RansacPnp(nn.Module):
 
     def __init__(
         self,
+        solver: SolverName = "p3p",
         iterations: int = 400,
         threshold: float = 10.0,
         min_inliers: int = 6,
         confidence: float | None = 0.9999,
         polish_rounds: int = 3,
-        polish_iterations: int = 10,
-        loss: RobustLoss | None = None,
+        mirror: bool = True,
+        polish: GaussNewtonPnp | None = None,
+        soft_selection: SoftInlierSelection | None = None,
         seed: int = 0,
         chunk: int = 50,
     ) -> None:
         super().__init__()
+        check_solver(solver)
         if iterations < 1 or chunk < 1:
             raise ValueError(f"iterations and chunk must be at least 1, got {iterations} and {chunk}")
         if not threshold > 0:
             raise ValueError(f"threshold must be positive (pixels), got {threshold}")
-        if min_inliers < _SAMPLE:
-            raise ValueError(f"min_inliers must be at least {_SAMPLE}, got {min_inliers}")
+        if min_inliers < SAMPLE_SIZE:
+            raise ValueError(f"min_inliers must be at least {SAMPLE_SIZE}, got {min_inliers}")
         if confidence is not None and not 0 < confidence < 1:
             raise ValueError(f"confidence must lie between 0 and 1, got {confidence}")
-        if polish_rounds < 0 or polish_iterations < 1:
-            raise ValueError(
-                "polish_rounds must be at least 0 and polish_iterations at least 1, "
-                f"got {polish_rounds} and {polish_iterations}"
-            )
+        if polish_rounds < 0:
+            raise ValueError(f"polish_rounds must be at least 0, got {polish_rounds}")
+        self.solver: SolverName = solver
         self.threshold = threshold
         self.min_inliers = min_inliers
         self.confidence = confidence
         self.polish_rounds = polish_rounds
-        self.polish_iterations = polish_iterations
-        self.loss = loss
+        self.mirror = mirror
+        self.polish = GaussNewtonPnp(max_iterations=10) if polish is None else polish
+        self.soft_selection = soft_selection
         self.chunk = chunk
         generator = torch.Generator().manual_seed(seed)
         # Integers, so that every device turns them into the same indices.
-        draws = torch.randint(2**31, (iterations, _SAMPLE), generator=generator)
+        draws = torch.randint(2**31, (iterations, SAMPLE_SIZE), generator=generator)
         self.register_buffer("draws", draws, persistent=False)
 
     def forward(
-        self, points_image: Tensor, points_model: Tensor, K: Tensor, valid: Tensor | None = None
+        self,
+        points_image: Tensor,
+        points_model: Tensor,
+        K: Tensor,
+        valid: Tensor | None = None,
+        weights: Tensor | None = None,
     ) -> PnpResult:
         """Estimate one pose per problem.
 
@@ -129,6 +143,8 @@ class RansacPnp(nn.Module):
             K: (B, 3, 3) intrinsics.
             valid: (B, N) bool, which correspondences exist; None means all. Those with coordinates that are
                 not finite, or too large to be squared, do not count either.
+            weights: (B, N), how much each counts in the polish; None means all the same. Those whose weight is not
+                positive (or no number) do not exist. Sampling and inlier counts do not look at weights.
 
         Returns:
             A :class:`PnpResult`.
@@ -136,17 +152,25 @@ class RansacPnp(nn.Module):
         Raises:
             ValueError: shapes or dtypes do not fit.
 
-        Differentiable w.r.t. ``points_image``, ``points_model`` and ``K`` through the polish on the selected
-        inliers (its steps are unrolled). Sampling and selection work on detached copies: they choose, and a
-        choice has no gradient.
+        Differentiable w.r.t. ``points_image``, ``points_model``, ``K``, ``weights`` and the parameters of the
+        polish's loss: the poses (and ``reprojection_rmse``) have the gradient of the optimum on the selected inliers,
+        by default by the implicit function theorem. Sampling, and which correspondences are inliers, are choices and
+        have no gradient; ``candidates`` makes up for that. Without polish (``polish_rounds=0``), or where it did not
+        help, the gradient is that of one Newton step on the inliers (unrolled: there is none).
         """
         check_correspondences(points_image, points_model, K, valid, name="valid")
+        check_correspondences(points_image, points_model, K, weights)
         # Autocast would run the matrix products in half precision, too coarse for poses.
         with torch.autocast(points_image.device.type, enabled=False):
-            return self._estimate(points_image, points_model, K, valid)
+            return self._estimate(points_image, points_model, K, valid, weights)
 
     def _estimate(
-        self, points_image: Tensor, points_model: Tensor, K: Tensor, valid: Tensor | None
+        self,
+        points_image: Tensor,
+        points_model: Tensor,
+        K: Tensor,
+        valid: Tensor | None,
+        weights: Tensor | None,
     ) -> PnpResult:
         determinant = torch.linalg.det(K.detach())
         invertible = torch.isfinite(determinant) & (determinant.abs() > 0)
@@ -154,118 +178,150 @@ class RansacPnp(nn.Module):
         rays = pixel_rays(points_image.detach(), K.detach())
         sane = usable_coordinates(points_image) & usable_coordinates(points_model) & usable_coordinates(rays)
         valid = sane if valid is None else sane & valid.bool()
+        if weights is not None:
+            weights = weights.to(points_image.dtype)
+            valid = valid & (weights > 0) & torch.isfinite(weights)
+            weights = weights.masked_fill(~valid, 0.0)
         points_image = points_image.masked_fill(~valid.unsqueeze(-1), 0.0)
         points_model = points_model.masked_fill(~valid.unsqueeze(-1), 0.0)
 
         count = valid.sum(-1)
-        usable = (count >= _SAMPLE) & invertible
-        fixed = (points_image.detach(), points_model.detach(), K.detach())
-        T, quality, determined = self._sample(*fixed, valid, usable)
-        found = quality >= 0
-        T = torch.where(found[:, None, None], T, _pose_in_front(fixed[1], valid))
-
-        inliers, cost = select_inliers(T, points_image, points_model, K, valid, self.threshold, self.loss)
-        # A problem takes part as long as its inliers change; below four there is nothing to polish on.
-        active = found & (inliers.sum(-1) >= _SAMPLE)
-        for _ in range(self.polish_rounds):
-            if not bool(active.any()):
-                break
-            polished = polish_pnp(
-                T,
-                points_image,
-                points_model,
-                K,
-                inliers & active.unsqueeze(-1),
-                loss=self.loss,
-                max_iterations=self.polish_iterations,
-            ).T
-            inliers_new, cost_new = select_inliers(
-                polished, points_image, points_model, K, valid, self.threshold, self.loss
+        hypotheses = self._sample(points_image, points_model, K, valid, (count >= SAMPLE_SIZE) & invertible)
+        kept = hypotheses.T.shape[1]
+        problem = _Problem(points_image, points_model, K, valid, weights)
+        found = hypotheses.quality.flatten() >= 0
+        T = torch.where(
+            found[:, None, None],
+            hypotheses.T.flatten(0, 1),
+            _pose_in_front(points_model.detach(), valid).repeat_interleave(kept, dim=0),
+        )
+        T, inliers = self._polish(T, found, problem.repeat(kept))
+        found = found.unflatten(0, (-1, kept))
+        candidates = None
+        if self.soft_selection is not None:
+            candidates = self.soft_selection(
+                T.unflatten(0, (-1, kept)), found, points_image, points_model, K, valid, self.threshold
             )
-            better = active & (inliers_new.sum(-1) >= _SAMPLE) & (cost_new <= cost)
-            active = better & (inliers_new != inliers).any(-1)
-            T = torch.where(better[:, None, None], polished, T)
-            inliers = torch.where(better[:, None], inliers_new, inliers)
-            cost = torch.where(better, cost_new, cost)
+        # The first hypothesis is the best.
+        T, inliers, found = T[::kept], inliers[::kept], found[:, 0]
 
-        inliers = inliers & found.unsqueeze(-1)
         num_inliers = inliers.sum(-1)
         status = torch.full_like(num_inliers, int(PnpStatus.OK))
         status = status.masked_fill(num_inliers < self.min_inliers, int(PnpStatus.TOO_FEW_INLIERS))
         status = status.masked_fill(~found, int(PnpStatus.BEHIND_CAMERA))
-        status = status.masked_fill(~determined, int(PnpStatus.DEGENERATE))
-        status = status.masked_fill(count < _SAMPLE, int(PnpStatus.TOO_FEW_CORRESPONDENCES))
+        status = status.masked_fill(~hypotheses.determined, int(PnpStatus.DEGENERATE))
+        status = status.masked_fill(count < SAMPLE_SIZE, int(PnpStatus.TOO_FEW_CORRESPONDENCES))
         squared, _ = reprojection_errors(T, points_image, points_model, K)
         mean = torch.where(inliers, squared, torch.zeros_like(squared)).sum(-1) / num_inliers.clamp(min=1)
         # The clamp keeps the square root's derivative finite for data that fit exactly.
         rmse = mean.clamp(min=torch.finfo(mean.dtype).tiny).sqrt()
         rmse = rmse.masked_fill(num_inliers == 0, torch.inf)
-        return PnpResult(T, inliers, num_inliers, status == int(PnpStatus.OK), status, rmse)
+        success = status == int(PnpStatus.OK)
+        return PnpResult(T, inliers, num_inliers, success, status, rmse, candidates)
 
     def _sample(
         self, points_image: Tensor, points_model: Tensor, K: Tensor, valid: Tensor, usable: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Best poses (B, 4, 4), their qualities (B,), −1 where there is none, and whether any sample determined
-        a pose (B,)."""
-        batch, total = points_image.shape[0], len(self.draws)
-        rays = pixel_rays(points_image, K)
-        count = valid.sum(-1)
-        # Valid correspondences first, so that a rank among the valid ones becomes an index.
-        order = torch.argsort((~valid).to(torch.uint8), dim=-1, stable=True)
-        best_T = torch.eye(4, dtype=K.dtype, device=K.device).repeat(batch, 1, 1)
-        best_quality = K.new_full((batch,), -1.0)
-        determined = torch.zeros_like(usable)
-        problems = usable.nonzero().squeeze(-1)
-        for first in range(0, total, self.chunk):
-            if problems.numel() == 0:
+    ) -> Hypotheses:
+        return sample_hypotheses(
+            points_image.detach(),
+            points_model.detach(),
+            K.detach(),
+            valid,
+            usable,
+            self.draws,
+            solver=self.solver,
+            threshold=self.threshold,
+            confidence=self.confidence,
+            chunk=self.chunk,
+            keep=1 if self.soft_selection is None else self.soft_selection.num_candidates,
+        )
+
+    def _polish(self, T: Tensor, found: Tensor, problem: "_Problem") -> tuple[Tensor, Tensor]:
+        """Polish poses (P, 4, 4) on their inliers; return them and the inliers (P, N) that they end up with."""
+        unrolled = self.polish.differentiation == "unrolled" and torch.is_grad_enabled()
+        with torch.set_grad_enabled(unrolled):
+            rounds = self.polish_rounds
+            state = self._climb(_Polished(T, *self._select(T, problem)), found, problem, rounds)
+            if self.mirror:
+                mirrored = mirrored_poses(state.T, problem.points_model, problem.weigh(state.inliers))
+                start = _Polished(mirrored, *self._select(mirrored, problem))
+                # A solid object does not look like its mirror image: most problems end here.
+                alike = found & (2 * start.inliers.sum(-1) >= state.inliers.sum(-1))
+                other = self._climb(start, alike, problem, min(rounds, 1))
+                better = alike & (other.cost < state.cost)
+                state = self._climb(_where(better, other, state), better, problem, rounds - 1)
+        T = state.T
+        if torch.is_grad_enabled() and not unrolled:
+            # The optimum is that of the inliers polished on, which the last selection may have changed.
+            used = problem.weigh(state.used & found.unsqueeze(-1))
+            T = self.polish.attach_gradient(T, *problem[:3], used)
+        return T, state.inliers & found.unsqueeze(-1)
+
+    def _select(self, T: Tensor, problem: "_Problem") -> tuple[Tensor, Tensor, Tensor]:
+        """Inliers of poses, twice, and truncated costs."""
+        inliers, cost = select_inliers(T, *problem[:4], self.threshold, problem.weights, self.polish.loss)
+        return inliers, inliers, cost
+
+    def _climb(self, state: "_Polished", active: Tensor, problem: "_Problem", rounds: int) -> "_Polished":
+        """Polish on the inliers and select them anew, in turns, as long as that lowers the truncated cost."""
+        # Below four inliers there is nothing to polish on.
+        active = active & (state.inliers.sum(-1) >= SAMPLE_SIZE)
+        for _ in range(rounds):
+            rows = active.nonzero().squeeze(-1)
+            if rows.numel() == 0:
                 break
-            ranks = distinct_ranks(self.draws[first : first + self.chunk], count[problems])
-            index = torch.take_along_dim(order[problems], ranks.flatten(1), dim=1).unsqueeze(-1)
-            pixels, model = points_image[problems], points_model[problems]
-            samples = ranks.shape[:2]
-            solution = solve_epnp_minimal(
-                torch.take_along_dim(rays[problems], index, dim=1).reshape(-1, _SAMPLE, 3),
-                torch.take_along_dim(model, index, dim=1).reshape(-1, _SAMPLE, 3),
-            )
-            T = solution.T_camera_from_model.unflatten(0, samples)
-            solved = solution.valid.unflatten(0, samples)
-            quality = score_poses(T, pixels, model, K[problems], valid[problems], self.threshold)
-            quality = quality.masked_fill(~solved, -1.0)
-            # The first of equally good samples, on every device.
-            top = quality.amax(-1, keepdim=True)
-            position = torch.arange(samples[1], device=quality.device).expand_as(quality)
-            position = position.masked_fill(quality < top, samples[1]).amin(-1)
-            T = torch.take_along_dim(T, position[:, None, None, None], dim=1).squeeze(1)
-            improved = top.squeeze(-1) > best_quality[problems]
-            best_T[problems] = torch.where(improved[:, None, None], T, best_T[problems])
-            best_quality[problems] = torch.where(improved, top.squeeze(-1), best_quality[problems])
-            determined[problems] |= (~solution.degenerate).unflatten(0, samples).any(-1)
-            if self.confidence is not None:
-                drawn = first + samples[1]
-                ratio = best_quality[problems].clamp(min=0.0).floor() / count[problems]
-                missed = drawn * torch.log1p(-ratio.clamp(max=1.0 - 1e-6).pow(_SAMPLE))
-                problems = problems[missed > math.log(1.0 - self.confidence)]
-        return best_T, best_quality, determined
+            part, before = problem.take(rows), _Polished(*(x[rows] for x in state))
+            T = self.polish.optimise(before.T, *part[:3], part.weigh(before.inliers))[0].T
+            inliers, _, cost = self._select(T, part)
+            better = (inliers.sum(-1) >= SAMPLE_SIZE) & (cost <= before.cost)
+            after = _where(better, _Polished(T, inliers, before.inliers, cost), before)
+            state = _Polished(*(x.index_copy(0, rows, y) for x, y in zip(state, after, strict=True)))
+            # A problem takes part as long as its inliers change.
+            active = active.index_copy(0, rows, better & (inliers != before.inliers).any(-1))
+        return state
 
 
-def distinct_ranks(draws: Tensor, count: Tensor) -> Tensor:
-    """Turn integers into distinct ranks below each problem's count, by exact integer arithmetic.
+class _Problem(NamedTuple):
+    """Correspondences of P problems."""
 
-    Args:
-        draws: (I, s) int64 in [0, 2³¹).
-        count: (B,) int64, at least s and below 2³².
+    points_image: Tensor
+    points_model: Tensor
+    K: Tensor
+    valid: Tensor
+    weights: Tensor | None
 
-    Returns:
-        (B, I, s) int64 ranks, distinct along the last dimension and uniform over ordered selections.
-    """
-    picked: list[Tensor] = []
-    for k in range(draws.shape[1]):
-        rank = (draws[:, k] * (count[:, None] - k)) >> 31
-        # Skip the ranks already taken, in ascending order.
-        for taken in torch.stack(picked, dim=-1).sort(dim=-1).values.unbind(-1) if picked else ():
-            rank = rank + (rank >= taken).to(rank.dtype)
-        picked.append(rank)
-    return torch.stack(picked, dim=-1)
+    def take(self, rows: Tensor) -> "_Problem":
+        """Some of the problems."""
+        weights = None if self.weights is None else self.weights[rows]
+        return _Problem(
+            self.points_image[rows], self.points_model[rows], self.K[rows], self.valid[rows], weights
+        )
+
+    def repeat(self, times: int) -> "_Problem":
+        """Each problem several times in a row."""
+        if times == 1:
+            return self
+        return self.take(torch.arange(len(self.K), device=self.K.device).repeat_interleave(times))
+
+    def weigh(self, inliers: Tensor) -> Tensor:
+        """Weights (P, N) of inliers, zero elsewhere."""
+        return inliers.to(self.K.dtype) if self.weights is None else inliers * self.weights
+
+
+class _Polished(NamedTuple):
+    """Poses (P, 4, 4), their inliers (P, N), the inliers that they were polished on, and truncated costs (P,)."""
+
+    T: Tensor
+    inliers: Tensor
+    used: Tensor
+    cost: Tensor
+
+
+def _where(condition: Tensor, a: _Polished, b: _Polished) -> _Polished:
+    """Rows of ``a`` where the condition (P,) holds, else of ``b``."""
+    return _Polished(
+        *(torch.where(condition.reshape(-1, *[1] * (x.dim() - 1)), x, y) for x, y in zip(a, b, strict=True))
+    )
 
 
 def _pose_in_front(points_model: Tensor, valid: Tensor) -> Tensor:

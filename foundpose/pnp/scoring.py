@@ -38,9 +38,10 @@ def select_inliers(
     K: Tensor,
     valid: Tensor,
     threshold: float,
+    weights: Tensor | None = None,
     loss: RobustLoss | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Inliers (B, N) of one pose (B, 4, 4) per problem, and its truncated cost (B,) in px².
+    """Inliers (B, N) of one pose (B, 4, 4) per problem, and its truncated cost (B,) in px²; constants.
 
     The truncated cost counts an inlier by its loss and all others by the loss at the threshold. The polish on
     the inliers never raises it, while it may well lose an inlier of a pose that was chosen for having many:
@@ -49,8 +50,8 @@ def select_inliers(
     squared, depth = reprojection_errors(T.detach(), points_image.detach(), points_model.detach(), K.detach())
     inliers = (squared <= threshold**2) & (depth > 0) & valid
     truncated = torch.where(inliers, squared, torch.full_like(squared, threshold**2))
-    cost = truncated if loss is None else loss(truncated)[0]
-    return inliers, cost.sum(-1)
+    cost = truncated if loss is None else loss(truncated)[0].detach()
+    return inliers, (cost if weights is None else cost * weights.detach()).sum(-1)
 
 
 def reprojection_errors(

@@ -1,10 +1,10 @@
-"""Poses under weak perspective: the start of EPnP's last case, and rigid alignment of two point sets."""
+"""Poses under weak perspective: the start of EPnP's last case, mirrored poses, and alignment of point sets."""
 
 import torch
 from torch import Tensor
 
 from foundpose.geometry.cameras import axis_rotation_to_ray
-from foundpose.geometry.transforms import make_transform, project_to_rotation
+from foundpose.geometry.transforms import make_transform, project_to_rotation, transform_points
 
 # Directions in which the object extends less than this share of its size count for little: an affine camera
 # fitted to nearly flat points would get its slope across the plane from noise.
@@ -68,6 +68,30 @@ def _camera_side(mean: Tensor, eps: float) -> Tensor:
     axis = torch.zeros_like(mean)
     axis[..., 2] = 1.0
     return torch.where(mean[..., 2:] > eps, mean, axis)
+
+
+def mirrored_poses(T: Tensor, points_model: Tensor, weights: Tensor) -> Tensor:
+    """The other poses under which flat objects look almost the same.
+
+    Seen from afar, a flat object and its mirror image in depth have the same projection (Necker's reversal). The
+    points are mirrored at the plane through their centroid across the line of sight, and the object is aligned with
+    them; a solid object cannot be, and gives a pose with a large error.
+
+    Args:
+        T: (B, 4, 4) poses.
+        points_model: (B, N, 3) mesh units.
+        weights: (B, N), not negative.
+
+    Returns:
+        (B, 4, 4), finite for finite input. A start for an optimisation: not differentiable.
+    """
+    T, points_model, weights = T.detach(), points_model.detach(), weights.detach()
+    weights = weights / weights.sum(-1, keepdim=True).clamp(min=torch.finfo(weights.dtype).tiny)
+    points = transform_points(T, points_model)
+    centroid = (weights.unsqueeze(-1) * points).sum(-2, keepdim=True)
+    sight = torch.nn.functional.normalize(centroid, dim=-1)
+    depth = ((points - centroid) * sight).sum(-1, keepdim=True)
+    return align_points(points - 2.0 * depth * sight, points_model, weights)
 
 
 def align_points(points_b: Tensor, points_a: Tensor, weights: Tensor) -> Tensor:

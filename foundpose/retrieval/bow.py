@@ -71,7 +71,9 @@ def assign_words(
         num_nearest: number of words per patch (all k if there are fewer).
 
     Returns:
-        Words and weights of each patch. Differentiable w.r.t. ``descriptors`` and ``words`` through the weights.
+        Words and weights of each patch.
+
+    Differentiable w.r.t. ``descriptors`` and ``words`` through the weights; the choice of words is constant.
     """
     # Padding may hold anything; zeros keep it out of the gradient as well.
     flat = descriptors.masked_fill(~valid.unsqueeze(-1), 0.0).flatten(0, 1)
@@ -161,7 +163,10 @@ class SoftAssignBow(nn.Module):
         self.num_nearest = num_nearest
 
     def assign(self, descriptors: Tensor, valid: Tensor, words: Tensor) -> WordAssignment:
-        """Soft-assign patches (B, P, d) with mask (B, P) to words (k, d); see `assign_words`."""
+        """Soft-assign patches (B, P, d) with mask (B, P) to words (k, d); see `assign_words`.
+
+        Differentiable w.r.t. ``descriptors`` and ``words`` through the weights; the choice of words is constant.
+        """
         if descriptors.ndim != 3 or valid.shape != descriptors.shape[:2] or valid.dtype != torch.bool:
             raise ValueError(
                 "descriptors and valid must have shapes (B, P, d) and (B, P) bool, got "

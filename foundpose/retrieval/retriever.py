@@ -8,9 +8,12 @@ from foundpose.retrieval.bow import SoftAssignBow
 
 
 def normalize_rows(x: Tensor) -> Tensor:
-    """Scale the rows of (..., k) to unit length; zero rows stay zero (with zero gradient)."""
+    """Scale the rows of (..., k) to unit length; zero rows stay zero.
+
+    Differentiable w.r.t. ``x``; a zero row, which has no direction, has gradient zero.
+    """
     norm = torch.linalg.vector_norm(x, dim=-1, keepdim=True)
-    return x / norm.where(norm > 0, torch.ones_like(norm))
+    return x / norm.where(norm > 0, torch.inf)
 
 
 def select_templates(similarity: Tensor, valid: Tensor, num_templates: int) -> RetrievedTemplates:
@@ -22,8 +25,9 @@ def select_templates(similarity: Tensor, valid: Tensor, num_templates: int) -> R
         num_templates: number h of templates to keep.
 
     Returns:
-        (B, h) templates, best first; padded with index 0 where h > T. Differentiable w.r.t. ``similarity``
-        through the similarities kept, not through the choice.
+        (B, h) templates, best first; padded with index 0 where h > T.
+
+    Differentiable w.r.t. ``similarity`` through the similarities kept; the choice of templates is constant.
     """
     kept = min(num_templates, similarity.shape[1])
     # topk leaves the order of equal values open, a stable sort does not.
@@ -71,8 +75,9 @@ class TemplateRetriever(nn.Module):
         Raises:
             ValueError: If the shapes of query and index do not fit.
 
-        Differentiable w.r.t. the query's descriptors, the words, the idf and the templates' descriptors through
-        the similarities; the choice of templates is constant.
+        Differentiable w.r.t. ``query.descriptors``, ``index.words``, ``index.idf`` and ``index.template_bow``
+        through ``similarity``; the choice of templates is constant, and so is the choice of nearest words.
+        ``template_bow`` is taken as given: it does not follow words and idf.
         """
         if index.template_bow.ndim != 2 or index.template_bow.shape[1] != index.words.shape[0]:
             raise ValueError(

@@ -10,11 +10,11 @@ import foundpose.matching.matcher as matcher_module
 from foundpose.matching.base import Matches
 from foundpose.matching.matcher import PatchMatcher, keep_best
 
-Problem = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
+Problem = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 
 
 def problem(B: int = 3, h: int = 4, P: int = 30, Q: int = 25, d: int = 5, seed: int = 0) -> Problem:
-    """Random float64 descriptors with ragged masks; pixels on a grid of 14 px."""
+    """Random float64 descriptors with ragged masks; pixels on a grid of 14 px; points in a box of 100."""
     g = torch.Generator().manual_seed(seed)
     query = torch.randn(B, P, d, generator=g, dtype=torch.float64)
     template = torch.randn(B, h, Q, d, generator=g, dtype=torch.float64)
@@ -22,14 +22,16 @@ def problem(B: int = 3, h: int = 4, P: int = 30, Q: int = 25, d: int = 5, seed: 
     template_valid = torch.rand(B, h, Q, generator=g) < 0.7
     cell = torch.arange(P, dtype=torch.float64)
     pixels = (torch.stack([cell % 6, cell // 6], dim=-1) * 14 + 6.5).expand(B, P, 2)
-    return query, query_valid, template, template_valid, pixels
+    points = torch.rand(B, h, Q, 3, generator=g, dtype=torch.float64) * 100 - 20
+    return query, query_valid, template, template_valid, pixels, points
 
 
 def brute_force(inputs: Problem, cyclic: bool, top_k: int | None) -> Matches:
-    query, query_valid, template, template_valid, pixels = (t.numpy() for t in inputs)
+    query, query_valid, template, template_valid, pixels, points = (t.numpy() for t in inputs)
     B, h, _, _ = template.shape
     P = query.shape[1]
     index, distance = np.zeros((B, h, P), dtype=int), np.full((B, h, P), np.inf)
+    matched = np.zeros((B, h, P, 3))
     for b in range(B):
         for t in range(h):
             rows, columns = np.flatnonzero(query_valid[b]), np.flatnonzero(template_valid[b, t])
@@ -43,15 +45,16 @@ def brute_force(inputs: Problem, cyclic: bool, top_k: int | None) -> Matches:
             kept = sorted(range(len(rows)), key=lambda i: (cycle[i], best[i], i))[:top_k]
             index[b, t, rows[kept]] = columns[forth[kept]]
             distance[b, t, rows[kept]] = best[kept]
-    return Matches(
-        torch.from_numpy(index), torch.from_numpy(distance), torch.from_numpy(np.isfinite(distance))
-    )
+            matched[b, t, rows[kept]] = points[b, t, columns[forth[kept]]]
+    valid = np.isfinite(distance)
+    return Matches(*(torch.from_numpy(x) for x in (index, distance, valid, matched, valid.astype(float))))
 
 
 def assert_same(got: Matches, expected: Matches) -> None:
     assert torch.equal(got.valid, expected.valid)
     assert torch.equal(got.template_patch, expected.template_patch)
-    torch.testing.assert_close(got.distance, expected.distance, check_dtype=False)
+    for name in ("distance", "points_model", "weight"):
+        torch.testing.assert_close(getattr(got, name), getattr(expected, name), check_dtype=False, msg=name)
 
 
 @pytest.mark.parametrize("mode", ["nearest", "cyclic"])
@@ -67,21 +70,22 @@ def test_equals_brute_force(mode: str, top_k: int | None) -> None:
 
 
 def test_equals_sklearn() -> None:
-    query, _, template, _, pixels = problem(B=1, h=1, P=200, Q=300, d=16)
+    query, _, template, _, pixels, points = problem(B=1, h=1, P=200, Q=300, d=16)
     all_of = torch.ones(1, 200, dtype=torch.bool), torch.ones(1, 1, 300, dtype=torch.bool)
-    got = PatchMatcher()(query, all_of[0], template, all_of[1], pixels)
+    got = PatchMatcher()(query, all_of[0], template, all_of[1], pixels, points)
     distance, index = NearestNeighbors(n_neighbors=1).fit(template[0, 0].numpy()).kneighbors(query[0].numpy())
     assert torch.equal(got.template_patch[0, 0], torch.from_numpy(index[:, 0]))
     torch.testing.assert_close(got.distance[0, 0], torch.from_numpy(distance[:, 0]))
 
 
 def test_patches_find_themselves_in_float32() -> None:
-    query, valid, _, _, pixels = problem(P=60, d=32)
+    query, valid, _, _, pixels, _ = problem(P=60, d=32)
+    points = torch.rand(3, 1, 60, 3)
     query = (40 + query).float()
     order = torch.randperm(60, generator=torch.Generator().manual_seed(0))
     template = query[:, None, order]
     for mode in ("nearest", "cyclic"):
-        got = PatchMatcher(mode)(query, valid, template, valid[:, None, order], pixels.float())
+        got = PatchMatcher(mode)(query, valid, template, valid[:, None, order], pixels.float(), points)
         assert torch.equal(order[got.template_patch[:, 0]][valid], torch.arange(60).expand(3, 60)[valid])
         # Distances come from differences: exactly 0 although |q| is about 200.
         assert (got.distance[:, 0][valid] == 0).all()
@@ -92,7 +96,8 @@ def test_ties_go_to_the_lowest_index() -> None:
     query_valid = torch.tensor([[False, True, True, True]])
     template_valid = torch.tensor([[[False, False, True, True, True]]])
     pixels = torch.tensor([[[0.0, 0], [14, 0], [28, 0], [42, 0]]])
-    got = PatchMatcher("cyclic", top_k=2)(query, query_valid, template, template_valid, pixels)
+    points = torch.zeros(1, 1, 5, 3)
+    got = PatchMatcher("cyclic", top_k=2)(query, query_valid, template, template_valid, pixels, points)
     # All match template patch 2, which returns to patch 1: cycle distances 0, 14, 28.
     assert got.template_patch.tolist() == [[[0, 2, 2, 0]]]
     assert got.valid.tolist() == [[[False, True, True, False]]]
@@ -114,9 +119,9 @@ def test_keep_best_is_lexicographic() -> None:
     top_k=st.sampled_from([None, 3, 12]),
 )
 def test_padding_and_batch_do_not_matter(seed: int, mode: str, top_k: int | None) -> None:
-    query, query_valid, template, template_valid, pixels = problem(seed=seed)
-    matcher = PatchMatcher(mode, top_k)
-    expected = matcher(query, query_valid, template, template_valid, pixels)
+    query, query_valid, template, template_valid, pixels, points = problem(seed=seed)
+    matcher = PatchMatcher(mode, top_k, confidence_temperature=0.8)
+    expected = matcher(query, query_valid, template, template_valid, pixels, points)
     far = 1e3
     padded = matcher(
         torch.nn.functional.pad(query.masked_fill(~query_valid[..., None], far), (0, 0, 0, 9), value=far),
@@ -124,11 +129,15 @@ def test_padding_and_batch_do_not_matter(seed: int, mode: str, top_k: int | None
         torch.nn.functional.pad(template.masked_fill(~template_valid[..., None], 0.0), (0, 0, 0, 6)),
         torch.nn.functional.pad(template_valid, (0, 6)),
         torch.nn.functional.pad(pixels, (0, 0, 0, 9)),
+        torch.nn.functional.pad(points, (0, 0, 0, 6)),
     )
     assert not padded.valid[..., 30:].any()
-    assert_same(Matches(*(t[..., :30] for t in padded)), expected)
-    alone = matcher(query[2:], query_valid[2:], template[2:, 3:], template_valid[2:, 3:], pixels[2:])
-    assert_same(alone, Matches(*(t[2:, 3:] for t in expected)))
+    assert_same(Matches(*(t[:, :, :30] for t in padded)), expected)
+    last = (slice(2, None), slice(3, None))
+    alone = matcher(
+        query[2:], query_valid[2:], template[last], template_valid[last], pixels[2:], points[last]
+    )
+    assert_same(alone, Matches(*(t[last] for t in expected)))
 
 
 @settings(max_examples=25, deadline=None)
@@ -147,22 +156,26 @@ def test_blocks_do_not_change_the_result(monkeypatch: pytest.MonkeyPatch) -> Non
     assert_same(PatchMatcher("cyclic", 10)(*inputs), expected)
 
 
-def test_gradcheck_of_distances() -> None:
-    query, query_valid, template, template_valid, pixels = problem(B=1, h=2, P=4, Q=5, d=3)
+def test_gradcheck() -> None:
+    query, query_valid, template, template_valid, pixels, points = problem(B=1, h=2, P=4, Q=5, d=3)
+    matcher = PatchMatcher("cyclic", 3, confidence_temperature=1.5)
 
-    def distances(q: Tensor, t: Tensor) -> Tensor:
-        matches = PatchMatcher("cyclic", 3)(q, query_valid, t, template_valid, pixels)
-        return matches.distance[matches.valid]
+    def run(q: Tensor, t: Tensor, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        matches = matcher(q, query_valid, t, template_valid, pixels, x)
+        # The spacing of the patches, part of the confidence, counts as constant.
+        weight = matcher(q, query_valid, t, template_valid, pixels, points).weight
+        return matches.distance[matches.valid], weight, matches.points_model
 
-    assert torch.autograd.gradcheck(distances, (query.requires_grad_(), template.requires_grad_()))
+    assert torch.autograd.gradcheck(run, [x.clone().requires_grad_() for x in (query, template, points)])
 
 
 def test_gradient_is_finite_at_zero_distance_and_for_invalid() -> None:
-    query, query_valid, _, _, pixels = problem(B=2)
+    query, query_valid, _, _, pixels, points = problem(B=2, h=1, Q=30)
     query.requires_grad_()
     template = query.detach()[:, None].clone().requires_grad_()
-    matches = PatchMatcher()(query, query_valid, template, query_valid[:, None], pixels)
-    matches.distance[matches.valid].sum().backward()
+    matcher = PatchMatcher(confidence_temperature=1e-3)
+    matches = matcher(query, query_valid, template, query_valid[:, None], pixels, points)
+    (matches.distance[matches.valid].sum() + matches.weight.sum()).backward()
     for leaf in (query, template):
         assert leaf.grad is not None
         assert leaf.grad.isfinite().all()
@@ -172,24 +185,28 @@ def test_gradient_is_finite_at_zero_distance_and_for_invalid() -> None:
 def test_empty_dimensions(empty: dict[str, int]) -> None:
     inputs = problem(**empty)
     got = PatchMatcher("cyclic", 5)(*inputs)
-    assert all(t.shape == (*inputs[2].shape[:2], inputs[0].shape[1]) for t in got)
+    assert all(t.shape[:3] == (*inputs[2].shape[:2], inputs[0].shape[1]) for t in got)
     assert not got.valid.any()
     assert got.template_patch.dtype == torch.int64
 
 
 def test_bad_input() -> None:
-    query, query_valid, template, template_valid, pixels = problem()
+    query, query_valid, template, template_valid, pixels, points = problem()
     matcher = PatchMatcher()
     with pytest.raises(ValueError, match=r"got \(3, 30, 5\) and \(3, 4, 25, 4\)"):
-        matcher(query, query_valid, template[..., :4], template_valid, pixels)
+        matcher(query, query_valid, template[..., :4], template_valid, pixels, points)
     with pytest.raises(ValueError, match=r"got \(3, 30, 5\) and \(4, 25, 5\)"):
-        matcher(query, query_valid, template[0], template_valid, pixels)
+        matcher(query, query_valid, template[0], template_valid, pixels, points)
     with pytest.raises(ValueError, match=r"query_valid must be bool of shape \(3, 30\), got \(3, 29\)"):
-        matcher(query, query_valid[:, :29], template, template_valid, pixels)
+        matcher(query, query_valid[:, :29], template, template_valid, pixels, points)
     with pytest.raises(ValueError, match=r"template_valid must be bool .* torch\.int64"):
-        matcher(query, query_valid, template, template_valid.long(), pixels)
+        matcher(query, query_valid, template, template_valid.long(), pixels, points)
     with pytest.raises(ValueError, match=r"query_pixels must have shape \(3, 30, 2\)"):
-        matcher(query, query_valid, template, template_valid, pixels[..., :1])
+        matcher(query, query_valid, template, template_valid, pixels[..., :1], points)
+    with pytest.raises(ValueError, match=r"template_points must have shape \(3, 4, 25, 3\)"):
+        matcher(query, query_valid, template, template_valid, pixels, points[..., :2])
+    with pytest.raises(ValueError, match="temperature must be positive"):
+        PatchMatcher(confidence_temperature=0.0)
     with pytest.raises(ValueError, match="got 'mutual'"):
         PatchMatcher("mutual")
     with pytest.raises(ValueError, match="top_k must be at least 1 or None, got 0"):

@@ -1,0 +1,116 @@
+"""The general and adaptive robust loss."""
+
+import torch
+from torch import Tensor, nn
+
+# Below this |y| a series stands in for (eʸ − 1) / y, whose derivatives cancel.
+_SERIES = 0.02
+
+
+class BarronLoss(nn.Module):
+    """Barron's loss: one family from least squares (α = 2) over Charbonnier (1), Cauchy (0) and Geman-McClure (−2)
+    to Welsch (−∞).
+
+    In Barron's notation, ``value(x) = |α − 2| / α · (((x / c)² / |α − 2| + 1)^(α / 2) − 1)`` with its limits at
+    α = 0, 2 and −∞. Called on squared residuals it is a :class:`RobustLoss`, ``ρ(x²) = 2 c² value(x)``: the same
+    minimiser, scaled so that small residuals count as in least squares.
+
+    Args:
+        alpha: shape α, any number or −inf or inf; the smaller, the less outliers count.
+        scale: c, residual at which the loss leaves the quadratic, in the residual's unit.
+        learnable: make α and c (by its logarithm) parameters. Minimising this loss alone over them is pointless
+            (smaller α is always cheaper); it is meant for an outer loss on what the optimisation returns.
+
+    Raises:
+        ValueError: ``scale`` is not positive, or ``alpha`` is NaN.
+
+    Differentiable w.r.t. residuals, α and c, everywhere; the derivative in α grows without bound (logarithmically)
+    towards α = 2.
+
+    Source: Barron, "A general and adaptive robust loss function", CVPR 2019; paper, "Featuremetric pose refinement"
+    (α = −5, c = 0.5).
+    """
+
+    alpha: Tensor
+    log_scale: Tensor
+
+    def __init__(self, alpha: float = -5.0, scale: float = 0.5, learnable: bool = False) -> None:
+        super().__init__()
+        if not scale > 0 or scale == float("inf"):
+            raise ValueError(f"scale must be positive and finite, got {scale}")
+        if alpha != alpha:
+            raise ValueError("alpha must be a number, got NaN")
+        shape, log_scale = torch.tensor(float(alpha)), torch.tensor(float(scale)).log()
+        self.learnable = learnable
+        if learnable:
+            self.alpha, self.log_scale = nn.Parameter(shape), nn.Parameter(log_scale)
+        else:
+            self.register_buffer("alpha", shape)
+            self.register_buffer("log_scale", log_scale)
+
+    @property
+    def scale(self) -> Tensor:
+        """c, a scalar tensor."""
+        return self.log_scale.exp()
+
+    @property
+    def ceiling(self) -> Tensor:
+        """Largest value of ρ, ``2 c² |α − 2| / |α|`` for α < 0 (Welsch: 2 c²); infinite for others."""
+        bounded = self.alpha < 0
+        alpha = torch.where(bounded, self.alpha, -torch.ones_like(self.alpha))
+        ratio = torch.where(torch.isinf(alpha), torch.ones_like(alpha), 1.0 - 2.0 / alpha)
+        return torch.where(bounded, 2.0 * self.scale.square() * ratio, torch.inf)
+
+    def forward(self, squared: Tensor) -> tuple[Tensor, Tensor]:
+        """ρ and the IRLS weight ρ' of squared residuals.
+
+        Args:
+            squared: any shape, not negative, the residual's unit squared.
+
+        Returns:
+            ρ, same shape and unit, and its derivative in [0, 1] for α ≤ 2 (1 at zero).
+        """
+        scale = self.scale.to(squared.dtype)
+        z = squared / scale.square()
+        half, weight = self._half(z)
+        return 2.0 * scale.square() * half, weight
+
+    def value(self, residual: Tensor) -> Tensor:
+        """Barron's ρ(x, α, c) of residuals of any shape; no unit."""
+        return self._half((residual / self.scale.to(residual.dtype)).square())[0]
+
+    def derivative(self, residual: Tensor) -> Tensor:
+        """∂ρ(x, α, c) / ∂x of residuals of any shape."""
+        return residual * self.weight(residual)
+
+    def weight(self, residual: Tensor) -> Tensor:
+        """IRLS weight ``(1 / x) ∂ρ(x, α, c) / ∂x``; 1 / c² at zero."""
+        scale = self.scale.to(residual.dtype)
+        return self._half((residual / scale).square())[1] / scale.square()
+
+    def extra_repr(self) -> str:
+        """Settings, for printing; they are part of what a result depends on."""
+        alpha, scale = self.alpha.item(), self.scale.item()
+        return f"alpha={alpha:g}, scale={scale:g}, learnable={self.learnable}"
+
+    def _half(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Barron's value and the weight relative to that at zero, of z = (x / c)²."""
+        eps = torch.finfo(z.dtype).eps
+        # Beyond ±1 / √eps the loss equals its limit to rounding, and b > 0 keeps z / b finite: at α = 2 the value
+        # does not depend on b.
+        alpha = self.alpha.to(z.dtype).clamp(-(eps**-0.5), eps**-0.5)
+        b = (alpha - 2.0).abs().clamp(min=eps)
+        u = torch.log1p(z / b)
+        # b / α ((z / b + 1)^(α / 2) − 1) = b u / 2 · (eʸ − 1) / y with y = α u / 2, smooth through α = 0.
+        return 0.5 * b * u * _expm1_ratio(0.5 * alpha * u), torch.exp((0.5 * alpha - 1.0) * u)
+
+
+def _expm1_ratio(y: Tensor) -> Tensor:
+    """(eʸ − 1) / y, smooth at zero."""
+    near = y.abs() < _SERIES
+    small = torch.where(near, y, torch.zeros_like(y))
+    large = torch.where(near, torch.ones_like(y), y)
+    series = torch.ones_like(y)
+    for k in range(8, 1, -1):
+        series = 1.0 + small / k * series
+    return torch.where(near, series, torch.expm1(large) / large)
