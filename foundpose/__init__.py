@@ -3,10 +3,10 @@
 from foundpose.estimates import PoseEstimates, PoseStatus
 from foundpose.features import DenseSift, DinoV2, FeatureHook, PatchExtractor, PcaProjection
 from foundpose.geometry import PerspectiveCrop, SphereInplane, SuperFibonacci
-from foundpose.matching import PatchMatcher
+from foundpose.matching import PatchMatcher, SoftPatchMatcher
 from foundpose.onboarding import ObjectRepresentation, Onboarder, RepresentationStore
 from foundpose.pipeline import FoundPose
-from foundpose.pnp import RansacPnp
+from foundpose.pnp import GaussNewtonPnp, RansacPnp, SoftInlierSelection
 from foundpose.rendering import Mesh, PyrenderRenderer, RaycastRenderer, load_mesh
 from foundpose.retrieval import SoftAssignBow, TemplateRetriever, VisualWords
 
@@ -17,6 +17,7 @@ __all__ = [
     "DinoV2",
     "FeatureHook",
     "FoundPose",
+    "GaussNewtonPnp",
     "Mesh",
     "ObjectRepresentation",
     "Onboarder",
@@ -31,6 +32,8 @@ __all__ = [
     "RaycastRenderer",
     "RepresentationStore",
     "SoftAssignBow",
+    "SoftInlierSelection",
+    "SoftPatchMatcher",
     "SphereInplane",
     "SuperFibonacci",
     "TemplateRetriever",

@@ -12,7 +12,7 @@ README = (Path(__file__).resolve().parents[1] / "README.md").read_text()
 
 
 def test_the_python_example_runs(tmp_path, monkeypatch, capsys):
-    (code,) = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+    code, training = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
     statements = [line for line in code.splitlines() if line and not line.startswith(("import", "from"))]
     assert len(statements) <= 10
     mesh = procedural_mesh(1, subdivisions=5)
@@ -37,6 +37,11 @@ def test_the_python_example_runs(tmp_path, monkeypatch, capsys):
     R = scene.T_camera_from_model[:3, :3]
     assert torch.rad2deg(rotation_angle(poses.T_camera_from_model[0, :3, :3], R)) < 10
     assert "tensor" in capsys.readouterr().out
+    names |= {"T_true": scene.T_camera_from_model, "diameter": torch.tensor([mesh.diameter])}
+    exec(compile(training, "README.md", "exec"), names)
+    assert 0 < names["loss"].item() < 0.2
+    assert names["image"].grad.isfinite().all()
+    assert names["image"].grad.abs().max() > 0
 
 
 def test_every_option_of_the_configuration_is_listed():

@@ -40,7 +40,10 @@ class PatchExtractor(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, images: Tensor) -> PatchFeatures:
-        """Describe the patches of RGB images (B, 3, S, S) with values in [0, 1]."""
+        """Describe the patches of RGB images (B, 3, S, S) with values in [0, 1].
+
+        Differentiable w.r.t. ``images`` and the extractor's parameters, unless a subclass says otherwise.
+        """
 
     @abstractmethod
     def fingerprint(self) -> Fingerprint:

@@ -104,7 +104,10 @@ class PatchNoise(PatchExtractor):
         self.seed = seed
 
     def forward(self, images: Tensor) -> PatchFeatures:
-        """Describe images (B, 3, S, S); noise has the root-mean-square norm of the image's descriptors."""
+        """Describe images (B, 3, S, S); noise has the root-mean-square norm of the image's descriptors.
+
+        Differentiable w.r.t. ``images`` and the disturbed extractor's parameters, through the patches that it leaves.
+        """
         features = self.extractor(images)
         patches = features.patches
         generator = torch.Generator().manual_seed(self.seed)

@@ -123,7 +123,10 @@ class PointMatchingLoss(nn.Module):
         diameter: Tensor | None = None,
         valid: Tensor | None = None,
     ) -> Tensor:
-        """Loss (B,), or () if reduced; arguments as for :func:`point_matching_error`."""
+        """Loss (B,), or () if reduced; arguments as for :func:`point_matching_error`.
+
+        Differentiable w.r.t. the same.
+        """
         errors = point_matching_error(T_est, T_true, points_model, symmetries, diameter, valid, self.norm)
         return reduce(errors, valid, self.reduction)
 

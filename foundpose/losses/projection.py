@@ -140,7 +140,10 @@ class ProjectionLoss(nn.Module):
         symmetries: Symmetries | None = None,
         valid: Tensor | None = None,
     ) -> Tensor:
-        """Loss (B,), or () if reduced; arguments as for :func:`projection_error`."""
+        """Loss (B,), or () if reduced; arguments as for :func:`projection_error`.
+
+        Differentiable w.r.t. the same.
+        """
         errors = projection_error(T_est, T_true, points_model, K, symmetries, valid, self.norm, self.near)
         return reduce(errors, valid, self.reduction)
 

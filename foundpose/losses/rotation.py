@@ -78,7 +78,10 @@ class GeodesicRotationLoss(nn.Module):
     def forward(
         self, T_est: Tensor, T_true: Tensor, symmetries: Symmetries | None = None, valid: Tensor | None = None
     ) -> Tensor:
-        """Loss (B,), or () if reduced; arguments as for :func:`geodesic_rotation_error`."""
+        """Loss (B,), or () if reduced; arguments as for :func:`geodesic_rotation_error`.
+
+        Differentiable w.r.t. the same.
+        """
         return reduce(geodesic_rotation_error(T_est, T_true, symmetries, valid), valid, self.reduction)
 
     def extra_repr(self) -> str:

@@ -151,7 +151,7 @@ class ObjectRepresentation(nn.Module):
 
     def memory_bytes(self) -> dict[str, int]:
         """Bytes taken by each part, and their ``total``."""
-        parts = {name: tensor.numel() * tensor.element_size() for name, tensor in self.named_buffers()}
+        parts = {name: tensor.numel() * tensor.element_size() for name, tensor in self.state_dict().items()}
         return parts | {"total": sum(parts.values())}
 
     def check_extractor(self, fingerprint: Fingerprint) -> None:
