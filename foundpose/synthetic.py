@@ -1,6 +1,9 @@
 """Procedural objects and cluttered pictures of them, for demos, tests and training without data."""
 
 import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -33,6 +36,39 @@ class SyntheticScene(NamedTuple):
     K: Tensor
     mask: Tensor
     T_camera_from_model: Tensor
+
+
+@dataclass(frozen=True)
+class LightVariation:
+    """How the light on an object and the camera's response vary from picture to picture; ranges are (low, high).
+
+    Args:
+        ambient: share of the light that comes from everywhere; the rest comes from one lamp.
+        tilt: largest angle between the lamp's direction and the camera's axis, degrees.
+        brightness: of the whole picture.
+        gain: of each colour channel.
+        noise: standard deviation of a pixel's value.
+
+    Raises:
+        ValueError: a range that is not one, or values that no light has.
+    """
+
+    ambient: Sequence[float] = (0.25, 0.9)
+    tilt: float = 70.0
+    brightness: Sequence[float] = (0.5, 1.2)
+    gain: Sequence[float] = (0.85, 1.1)
+    noise: Sequence[float] = (0.0, 0.03)
+
+    def __post_init__(self) -> None:
+        for name in ("ambient", "brightness", "gain", "noise"):
+            bounds = getattr(self, name)
+            if len(bounds) != 2 or not 0.0 <= bounds[0] <= bounds[1]:
+                raise ValueError(f"{name} must be (low, high) with 0 <= low <= high, got {tuple(bounds)}")
+        if self.ambient[1] > 1.0 or not 0.0 <= self.tilt <= 90.0:
+            raise ValueError(
+                f"ambient must not exceed 1 and tilt lie in [0, 90] degrees, got {tuple(self.ambient)} "
+                f"and {self.tilt}"
+            )
 
 
 def procedural_mesh(seed: int, diameter: float = 120.0, subdivisions: int = 6) -> Mesh:
@@ -77,6 +113,15 @@ def procedural_mesh(seed: int, diameter: float = 120.0, subdivisions: int = 6) -
     )
 
 
+def combine_seeds(*numbers: int) -> int:
+    """One seed of 32 bits from several integers, another for other integers or another order.
+
+    PyTorch's generator on the CPU reads no more than the lowest 32 bits of a seed.
+    """
+    words = [number % (1 << 64) for number in numbers]
+    return int(np.random.SeedSequence(words).generate_state(1)[0])
+
+
 def random_rotation(generator: torch.Generator) -> Tensor:
     """A uniformly random rotation (3, 3), float64."""
     # The rotation nearest to a Gaussian matrix is uniform on SO(3), up to reflections, which are turned over.
@@ -90,6 +135,7 @@ def cluttered_scene(
     width: int = 640,
     occlusion: bool = True,
     renderer: Renderer | None = None,
+    light: LightVariation | None = None,
 ) -> SyntheticScene:
     """Picture of an object in front of and behind clutter, under another light than the templates', with noise.
 
@@ -100,6 +146,8 @@ def cluttered_scene(
         width: of the picture in pixels.
         occlusion: hide a corner of the object.
         renderer: draws the object; by default a ray caster with much ambient light.
+        light: how much the light varies; the share of ambient light is then the light's, not the renderer's. The
+            object, its pose and the clutter stay what they are without.
     """
     generator = torch.Generator().manual_seed(seed)
 
@@ -117,14 +165,51 @@ def cluttered_scene(
     T = make_transform(R, t).float()
 
     renderer = renderer or RaycastRenderer(ambient=0.75)
-    render = renderer(mesh, T[None], K[None], (height, width))
+    if light is None:
+        render = renderer(mesh, T[None], K[None], (height, width))
+        shown = render.rgb[0]
+    else:
+        lamp = torch.Generator().manual_seed(combine_seeds(seed, 1))
+        with _ambient_light_only(renderer):
+            render = renderer(mesh, T[None], K[None], (height, width))
+        shown = _shine(render.rgb[0], render.normals[0], light, lamp)
     mask = render.mask[0]
-    image = torch.where(mask, render.rgb[0], _clutter(height, width, generator, shapes=150))
+    image = torch.where(mask, shown, _clutter(height, width, generator, shapes=150))
     if occlusion:
         image, mask = _hide_corner(image, mask, generator)
     gain = torch.tensor([uniform(0.85, 1.1) for _ in range(3)])[:, None, None]
-    image = image * gain + 0.015 * torch.randn(image.shape, generator=generator)
+    noise = 0.015
+    if light is not None:
+        gain = _draw(light.gain, 3, lamp)[:, None, None] * _draw(light.brightness, 1, lamp)
+        noise = float(_draw(light.noise, 1, lamp))
+    image = image * gain + noise * torch.randn(image.shape, generator=generator)
     return SyntheticScene(image.clamp(0, 1), K, mask, T)
+
+
+@contextmanager
+def _ambient_light_only(renderer: Renderer) -> Iterator[None]:
+    """Take the renderer's lamp away for a while. (A copy would have to set up its own meshes and GL context.)"""
+    before, renderer.ambient = renderer.ambient, 1.0
+    try:
+        yield
+    finally:
+        renderer.ambient = before
+
+
+def _shine(albedo: Tensor, normals: Tensor, light: LightVariation, generator: torch.Generator) -> Tensor:
+    """Light a picture (3, H, W) without shading by a distant lamp from somewhere; normals as in RenderOutput."""
+    ambient = _draw(light.ambient, 1, generator)
+    tilt, azimuth = torch.deg2rad(
+        torch.cat([_draw((0.0, light.tilt), 1, generator), _draw((0, 360), 1, generator)])
+    )
+    to_lamp = torch.stack([tilt.sin() * azimuth.cos(), tilt.sin() * azimuth.sin(), -tilt.cos()])
+    cosine = (normals * to_lamp[:, None, None]).sum(0).clamp(min=0.0)
+    return albedo * (ambient + (1.0 - ambient) * cosine)
+
+
+def _draw(bounds: Sequence[float], count: int, generator: torch.Generator) -> Tensor:
+    """``count`` numbers between two bounds."""
+    return bounds[0] + (bounds[1] - bounds[0]) * torch.rand(count, generator=generator)
 
 
 def _clutter(height: int, width: int, generator: torch.Generator, shapes: int) -> Tensor:

@@ -3,6 +3,7 @@
 Nothing here imports transformers before a ``DinoV2`` is constructed.
 """
 
+from foundpose.features.adapter import AdaptedExtractor, ResidualAdapter
 from foundpose.features.base import Fingerprint, PatchExtractor, PatchFeatures
 from foundpose.features.dense_sift import DenseSift
 from foundpose.features.dinov2 import DinoV2
@@ -12,6 +13,7 @@ from foundpose.features.oracle import CoordinateCode, PatchNoise
 from foundpose.features.pca import PcaProjection
 
 __all__ = [
+    "AdaptedExtractor",
     "CoordinateCode",
     "DenseSift",
     "DinoV2",
@@ -21,5 +23,6 @@ __all__ = [
     "PatchFeatures",
     "PatchNoise",
     "PcaProjection",
+    "ResidualAdapter",
     "WeightsNotFoundError",
 ]

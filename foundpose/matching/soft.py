@@ -16,8 +16,8 @@ class SoftPatchMatcher(nn.Module):
     variance (summed over the three coordinates) and s the spacing of the template's patches on the object: inverse
     variance, as least squares wants it. As τ goes to 0 this becomes the nearest matcher with confidences of 1.
 
-    An expectation is drawn towards the middle of the points that it averages, so a large τ shrinks the object and puts
-    it at a wrong depth: keep τ well below the distance of neighbouring patches' descriptors.
+    An expectation is drawn towards the middle of the points that it averages, so a large τ shrinks the object and
+    puts it at a wrong depth: keep τ well below the distance of neighbouring patches' descriptors.
 
     Args:
         temperature: τ, in the unit of the descriptors.

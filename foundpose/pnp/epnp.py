@@ -4,6 +4,10 @@ The camera-frame coordinates of a few control points span the object; the image 
 β of null vectors, and the distances between the control points fix β. With exactly four correspondences the
 correspondences themselves serve as control points: the null vectors are then the four rays, known without any
 decomposition, and β are the distances along them.
+
+Decompositions and iterations run on detached tensors and get their gradient afterwards: eigenvectors by first-order
+perturbation, β by the implicit function theorem. Samples that determine no pose are swapped for a fixed one that does
+and get the identity in the end, so that they neither have nor disturb a gradient.
 """
 
 from collections.abc import Callable
@@ -12,14 +16,17 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from foundpose.geometry.cameras import pixel_rays
 from foundpose.geometry.transforms import make_transform, transform_points
-from foundpose.pnp.polish import check_correspondences, usable_coordinates
+from foundpose.pnp.derivatives import attach_optimum, eigenbasis, safe_sqrt
+from foundpose.pnp.polish import check_correspondences, rays_of_usable_pixels, usable_coordinates
 from foundpose.pnp.weak_perspective import align_points, weak_perspective_depths
 
 # Relative squared area below which points count as collinear; far above float32's rounding.
 _COLLINEAR = 1e-5
 _REFINEMENT_STEPS = 5
+
+# Cost, its Gauss-Newton matrix and gradient in β, and the errors of squared distances.
+_Equations = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
 class MinimalSolution(NamedTuple):
@@ -28,7 +35,8 @@ class MinimalSolution(NamedTuple):
     Attributes:
         T_camera_from_model: (B, 4, 4), always finite.
         valid: (B,) bool, the points determine a pose and it has all of them in front of the camera.
-        degenerate: (B,) bool, the points do not determine a pose (fewer than four, collinear, or coincident).
+        degenerate: (B,) bool, the points do not determine a pose: fewer than four, collinear or coincident ones, one
+            pixel for all (of exactly four: for any two), or intrinsics without inverse. The pose is the identity.
     """
 
     T_camera_from_model: Tensor
@@ -50,17 +58,23 @@ def solve_epnp(
         points_image: (B, N, 2) pixels.
         points_model: (B, N, 3) mesh units.
         K: (B, 3, 3) intrinsics.
-        weights: (B, N), not negative, or a bool mask; None means all ones. Points of weight zero are ignored.
-            With N = 4 weights only tell whether all four points are there.
+        weights: (B, N), or a bool mask; None means all ones. Points whose weight is not positive, or any number of
+            which is not finite, are ignored. With N = 4 weights only tell whether all four points are there.
 
     Returns:
         A :class:`MinimalSolution`. Bad samples are flagged; nothing is raised for them.
 
     Raises:
-        ValueError: shapes do not fit or N < 4.
+        ValueError: shapes or dtypes do not fit, or N < 4.
 
-    Differentiable w.r.t. ``points_image``, ``points_model`` and ``K`` where the decompositions are, which
-    excludes repeated singular values; for gradients polish the pose instead (:func:`polish_pnp`).
+    Differentiable w.r.t. ``points_image``, ``points_model``, ``K`` and, for N > 4, ``weights`` (first
+    derivatives), finite everywhere and zero for degenerate samples. It is the exact gradient of the least-squares
+    optimum β of the winning candidate: equal to that of the returned pose where the five refinement steps have
+    converged, as they mostly do, not so well under strong noise with N = 4. Which candidate wins is a choice and
+    has no gradient; neither have turns inside repeated eigenspaces. So the derivative is one-sided or does not exist,
+    and what comes out is that of one branch, where candidates tie (points that fit exactly, if N > 4), for N = 5
+    where a single one of the two null vectors wins, and where two principal axes are equally long and the points
+    do not fit exactly. For exactly flat objects the same holds for motion of model points out of their plane.
 
     Source: Lepetit, Moreno-Noguer and Fua, "EPnP: an accurate O(n) solution to the PnP problem", IJCV 2009.
     """
@@ -68,17 +82,17 @@ def solve_epnp(
     if points_image.shape[1] < 4:
         raise ValueError(f"EPnP needs at least 4 correspondences, got N = {points_image.shape[1]}")
     present = torch.ones_like(points_image[..., 0]) if weights is None else weights.to(points_image.dtype)
-    rays = pixel_rays(points_image, K)
-    finite = usable_coordinates(rays) & usable_coordinates(points_model) & torch.isfinite(present)
-    present = present.masked_fill(~finite, 0.0)
-    bad = ~finite.unsqueeze(-1)
+    rays, usable = rays_of_usable_pixels(points_image, K)
+    usable = usable & usable_coordinates(rays) & usable_coordinates(points_model)
+    usable = usable & (present > 0) & torch.isfinite(present)
+    if points_image.shape[1] == 4:
+        usable = usable.all(-1, keepdim=True).expand_as(usable)
+    bad = ~usable.unsqueeze(-1)
     rays = torch.where(bad, rays.new_tensor([0.0, 0.0, 1.0]), rays)
     points_model = points_model.masked_fill(bad, 0.0)
     if points_image.shape[1] == 4:
-        solution = solve_epnp_minimal(rays, points_model)
-        missing = ~(present > 0).all(-1)
-        return solution._replace(valid=solution.valid & ~missing, degenerate=solution.degenerate | missing)
-    return _solve_overdetermined(rays, points_model, present)
+        return solve_epnp_minimal(rays, points_model)  # which flags four equal points
+    return _solve_overdetermined(rays, points_model, present.masked_fill(~usable, 0.0))
 
 
 def solve_epnp_minimal(rays: Tensor, points_model: Tensor) -> MinimalSolution:
@@ -94,18 +108,20 @@ def solve_epnp_minimal(rays: Tensor, points_model: Tensor) -> MinimalSolution:
     weights = torch.full_like(rays[..., 0], 0.25)
     points, centroid, size = _normalise(points_model, weights)
     bearings = rays / torch.linalg.vector_norm(rays, dim=-1, keepdim=True)
-
-    chord = (bearings.unsqueeze(-2) - bearings.unsqueeze(-3)).square().sum(-1)
-    distance = (points.unsqueeze(-2) - points.unsqueeze(-3)).square().sum(-1)
+    chord, distance = _squared_distances(bearings), _squared_distances(points)
     eps = torch.finfo(rays.dtype).eps
     off_diagonal = ~torch.eye(4, dtype=torch.bool, device=rays.device)
     repeated = (((distance < 1e-8) | (chord < eps**2)) & off_diagonal).any(-1).any(-1)
     degenerate = repeated | _collinear(points, weights)
+    needs_gradient = rays.requires_grad or points.requires_grad
+    if needs_gradient:
+        rays, bearings, points = _stand_in(degenerate, rays, points)
+        chord, distance = _squared_distances(bearings), _squared_distances(points)
 
     depths = weak_perspective_depths(bearings, points, weights)  # (S, 2, 4)
     chord, distance = chord.unsqueeze(1), distance.unsqueeze(1)
 
-    def equations(beta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def equations(beta: Tensor, chord: Tensor, distance: Tensor) -> _Equations:
         # |β_i r_i − β_j r_j|² = (β_i − β_j)² + β_i β_j |r_i − r_j|²: no cancellation in a narrow field of view.
         row, column = beta.unsqueeze(-1), beta.unsqueeze(-2)
         difference = row - column
@@ -113,22 +129,32 @@ def solve_epnp_minimal(rays: Tensor, points_model: Tensor) -> MinimalSolution:
         slope = 2.0 * difference + column * chord  # of error (i, j) in β_i
         # A pair touches two unknowns only, so the Gauss-Newton matrix needs no product of Jacobians.
         H = slope * slope.transpose(-1, -2) + torch.diag_embed(slope.square().sum(-1))
-        return 0.25 * error.square().sum((-1, -2)), H, (slope * error).sum(-1)
+        return 0.25 * error.square().sum((-1, -2)), H, (slope * error).sum(-1), error
 
-    depths = _refine(depths, equations, lower=eps)
+    fixed = chord.detach(), distance.detach()
+    depths = _refine(depths, lambda beta: equations(beta, *fixed), lower=eps)
+    if needs_gradient:
+        _, H, g, error = equations(depths, chord, distance)
+        curvature = error * (chord - 2.0) + torch.diag_embed(2.0 * error.sum(-1))
+        depths = attach_optimum(depths, H + curvature, g)
     T = align_points(depths.unsqueeze(-1) * bearings.unsqueeze(1), points.unsqueeze(1), weights.unsqueeze(1))
     return _best_candidate(T, rays, points, weights, centroid, size, degenerate)
 
 
 def _solve_overdetermined(rays: Tensor, points_model: Tensor, weights: Tensor) -> MinimalSolution:
-    enough = (weights > 0).sum(-1) >= 4
+    used = weights > 0
     weights = weights / weights.sum(-1, keepdim=True).clamp(min=torch.finfo(weights.dtype).tiny)
     points, centroid, size = _normalise(points_model, weights)
-    degenerate = ~enough | _collinear(points, weights)
-    variances, axes = torch.linalg.eigh(_spread(points, weights))
-    extents, axes = variances.clamp(min=0.0).sqrt().flip(-1), axes.flip(-1)
     bearings = rays / torch.linalg.vector_norm(rays, dim=-1, keepdim=True)
-    starts = weak_perspective_depths(bearings, points, weights).unsqueeze(-1) * bearings.unsqueeze(1)
+    offset = (bearings - (weights.unsqueeze(-1) * bearings).sum(-2, keepdim=True)).abs().amax(-1)
+    same_ray = (offset * used).amax(-1) <= 4.0 * torch.finfo(rays.dtype).eps
+    degenerate = (used.sum(-1) < 4) | same_ray | _collinear(points, weights)
+    rays, bearings, points = _stand_in(degenerate, rays, points)
+    weights = torch.where(degenerate.unsqueeze(-1), 1.0 / weights.shape[-1], weights)
+
+    variances, axes = eigenbasis(_spread(points, weights))
+    extents, axes = safe_sqrt(variances).flip(-1), axes.flip(-1)
+    starts = weak_perspective_depths(bearings, points, weights).unsqueeze(-1) * bearings.detach().unsqueeze(1)
     candidates = [
         _candidates(rays, points, weights, extents[:, :dimension], axes[..., :dimension], starts)
         for dimension in (3, 2)
@@ -148,33 +174,38 @@ def _candidates(
     controls = torch.cat([torch.zeros_like(tips[:, :1]), tips], dim=-2)  # (B, c, 3)
 
     # Each point gives two equations Σ_j α_j (X_j − x Z_j) = 0 and Σ_j α_j (Y_j − y Z_j) = 0.
-    weighted = barycentric * weights.sqrt().unsqueeze(-1)
+    weighted = barycentric * safe_sqrt(weights).unsqueeze(-1)
     zero = torch.zeros_like(weighted)
     row_x = torch.stack([weighted, zero, -weighted * rays[..., :1]], dim=-1).flatten(-2)
     row_y = torch.stack([zero, weighted, -weighted * rays[..., 1:2]], dim=-1).flatten(-2)
     M = torch.cat([row_x, row_y], dim=-2)
-    _, vectors = torch.linalg.eigh(M.transpose(-1, -2) @ M)
+    _, vectors = eigenbasis(M.transpose(-1, -2) @ M)
     null = vectors[..., :count].transpose(-1, -2).unflatten(-1, (count, 3))  # (B, k, c, 3), k = c
 
     i, j = torch.triu_indices(count, count, offset=1, device=points.device)
     edges = null[..., i, :] - null[..., j, :]  # (B, k, pairs, 3)
     gram = torch.einsum("bkpx,blpx->bpkl", edges, edges)
     distance = (controls[:, i] - controls[:, j]).square().sum(-1)
-    beta = torch.cat(
-        [_linearised_betas(gram, distance), _betas_of_start(null, barycentric, weights, starts)], dim=1
-    )
+    fixed = gram.detach(), distance.detach()
+    of_starts = _betas_of_start(null.detach(), barycentric.detach(), weights.detach(), starts)
+    beta = torch.cat([_linearised_betas(*fixed), of_starts], dim=1).nan_to_num(0.0, 0.0, 0.0)
     free = torch.ones_like(beta, dtype=torch.bool)
     for vectors_used in range(1, count):
         free[:, vectors_used - 1, vectors_used:] = False
 
-    def equations(beta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def equations(beta: Tensor, gram: Tensor, distance: Tensor) -> _Equations:
         half_slope = torch.einsum("bpkl,bnl->bnpk", gram, beta)
         error = torch.einsum("bnpk,bnk->bnp", half_slope, beta) - distance.unsqueeze(1)
         J = 2.0 * half_slope * free.unsqueeze(-2)
         H = J.transpose(-1, -2) @ J
-        return 0.5 * error.square().sum(-1), H, (J.transpose(-1, -2) @ error.unsqueeze(-1)).squeeze(-1)
+        g = (J.transpose(-1, -2) @ error.unsqueeze(-1)).squeeze(-1)
+        return 0.5 * error.square().sum(-1), H, g, error
 
-    beta = _refine(beta, equations)
+    beta = _refine(beta, lambda beta: equations(beta, *fixed))
+    if gram.requires_grad or distance.requires_grad:
+        _, H, g, error = equations(beta, gram, distance)
+        curvature = 2.0 * torch.einsum("bnp,bpkl->bnkl", error, gram)
+        beta = attach_optimum(beta, H + curvature * (free.unsqueeze(-1) & free.unsqueeze(-2)), g)
     controls_camera = torch.einsum("bnk,bkcx->bncx", beta, null)
     points_camera = barycentric.unsqueeze(1) @ controls_camera
     mean_depth = (weights.unsqueeze(1) * points_camera[..., 2]).sum(-1)
@@ -214,19 +245,17 @@ def _betas_of_start(null: Tensor, barycentric: Tensor, weights: Tensor, starts: 
     return torch.einsum("bkcx,bncx->bnk", null, controls)
 
 
-def _refine(
-    beta: Tensor, equations: Callable[[Tensor], tuple[Tensor, Tensor, Tensor]], lower: float | None = None
-) -> Tensor:
-    """Damped Gauss-Newton on β (..., k); ``equations`` gives cost, H and g; β stays above ``lower`` if given."""
+def _refine(beta: Tensor, equations: Callable[[Tensor], _Equations], lower: float | None = None) -> Tensor:
+    """Damped Gauss-Newton on β (..., k), which stays above ``lower`` if given. Give it detached tensors."""
     identity = torch.eye(beta.shape[-1], dtype=beta.dtype, device=beta.device)
-    cost, H, g = equations(beta)
+    cost, H, g, _ = equations(beta)
     damping = torch.full_like(cost, 1e-3)
     for step in range(_REFINEMENT_STEPS):
         diagonal = H.diagonal(dim1=-2, dim2=-1)
         ridge = 1e-3 * torch.finfo(beta.dtype).eps * diagonal.amax(-1, keepdim=True) + 1e-30
         damped = H + (damping.unsqueeze(-1) * diagonal + ridge).unsqueeze(-1) * identity
         new = beta - torch.linalg.solve_ex(damped, g.unsqueeze(-1))[0].squeeze(-1)
-        cost_new, H_new, g_new = equations(new)
+        cost_new, H_new, g_new, _ = equations(new)
         better = cost_new <= cost
         if lower is not None:
             better = better & (new > lower).all(-1)
@@ -241,12 +270,30 @@ def _refine(
 
 
 def _normalise(points: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Move points (S, N, 3) to weighted centroid zero and root mean square one; also the centroid and size."""
+    """Move points (S, N, 3) to weighted centroid zero and root mean square one; also the centroid and size.
+
+    The pose does not depend on the size that the points are solved at, so it has no gradient.
+    """
     centroid = (weights.unsqueeze(-1) * points).sum(-2, keepdim=True)
     centred = points - centroid
-    size = (weights * centred.square().sum(-1)).sum(-1).sqrt()[:, None]
+    size = (weights * centred.square().sum(-1)).sum(-1).detach().sqrt()[:, None]
     size = torch.where(size > 0, size, torch.ones_like(size))
     return centred / size.unsqueeze(-1), centroid.squeeze(-2), size
+
+
+def _stand_in(degenerate: Tensor, rays: Tensor, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Rays, bearings and points of solvable problems, the same one for all degenerate samples."""
+    cloud = torch.arange(3.0 * points.shape[1], dtype=points.dtype, device=points.device).square().sin()
+    cloud = cloud.unflatten(0, (-1, 3))
+    ahead = cloud + cloud.new_tensor([0.0, 0.0, 4.0])
+    rays = torch.where(degenerate[:, None, None], ahead / ahead[:, 2:], rays)
+    bearings = rays / torch.linalg.vector_norm(rays, dim=-1, keepdim=True)
+    return rays, bearings, torch.where(degenerate[:, None, None], cloud, points)
+
+
+def _squared_distances(points: Tensor) -> Tensor:
+    """(S, N, 3) → (S, N, N)."""
+    return (points.unsqueeze(-2) - points.unsqueeze(-3)).square().sum(-1)
 
 
 def _spread(points: Tensor, weights: Tensor) -> Tensor:
@@ -270,19 +317,19 @@ def _best_candidate(
     degenerate: Tensor,
 ) -> MinimalSolution:
     """Pick by reprojection error among candidates (S, n, 4, 4) for normalised points, and undo the scaling."""
-    points_camera = transform_points(T, points.unsqueeze(1))
+    points_camera = transform_points(T.detach(), points.detach().unsqueeze(1))
     depth = points_camera[..., 2]
     used = (weights > 0).unsqueeze(1)
     behind = ((depth <= 0) & used).any(-1)
     plane = points_camera[..., :2] / torch.where(depth > 0, depth, torch.ones_like(depth)).unsqueeze(-1)
-    squared = (plane - rays[..., :2].unsqueeze(1)).square().sum(-1)
-    error = (weights.unsqueeze(1) * squared).sum(-1).masked_fill(behind, torch.inf)
+    squared = (plane - rays[..., :2].detach().unsqueeze(1)).square().sum(-1)
+    error = (weights.detach().unsqueeze(1) * squared).sum(-1).masked_fill(behind, torch.inf)
     best = error.argmin(dim=-1)
     T = torch.take_along_dim(T, best[:, None, None, None], dim=1).squeeze(1)
     in_front = ~torch.take_along_dim(behind, best[:, None], dim=1).squeeze(1)
     R = T[:, :3, :3]
     t = size * T[:, :3, 3] - (R @ centroid.unsqueeze(-1)).squeeze(-1)
     T = make_transform(R, t)
-    finite = torch.isfinite(T).all(-1).all(-1)
-    T = torch.where(finite[:, None, None], T, torch.eye(4, dtype=T.dtype, device=T.device))
-    return MinimalSolution(T, in_front & finite & ~degenerate, degenerate)
+    solved = torch.isfinite(T).all(-1).all(-1) & ~degenerate
+    T = torch.where(solved[:, None, None], T, torch.eye(4, dtype=T.dtype, device=T.device))
+    return MinimalSolution(T, in_front & solved, degenerate)

@@ -187,16 +187,7 @@ class GaussNewtonPnp(nn.Module):
             variance = torch.full_like(H[:, 0, 0], self.noise**2)
             known = torch.ones_like(variance, dtype=torch.bool)
         system = scaled_cholesky(H, H.diagonal(dim1=-2, dim2=-1))
-        # A twist (v, ω) at the local origin is (size v + origin × ω, ω) at the camera's.
-        identity = torch.eye(3, dtype=H.dtype, device=H.device).expand(len(H), 3, 3)
-        cross = torch.linalg.cross(frame.origin.unsqueeze(-1).expand(-1, 3, 3), identity, dim=-2)
-        to_camera = torch.cat(
-            [
-                torch.cat([frame.size.unsqueeze(-1) * identity, cross], dim=-1),
-                torch.cat([torch.zeros_like(cross), identity], dim=-1),
-            ],
-            dim=-2,
-        )
+        to_camera = frame.twist_to_camera()
         covariance = variance[:, None, None] * (to_camera @ system.inverse() @ to_camera.transpose(-1, -2))
         unknown = torch.diag_embed(torch.full_like(H[:, 0], torch.inf))
         return torch.where((known & system.usable)[:, None, None], covariance, unknown)

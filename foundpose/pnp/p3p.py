@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from foundpose.geometry.transforms import make_transform
-from foundpose.pnp.polish import check_correspondences, usable_coordinates
+from foundpose.pnp.polish import check_correspondences, rays_of_usable_pixels, usable_coordinates
 
 _CUBIC_STEPS, _POLISH_STEPS = 5, 2
 _LARGEST_SLOPE = 100.0  # x / z of a ray; no pinhole camera sees as far from its axis
@@ -62,16 +62,8 @@ def solve_p3p(points_image: Tensor, points_model: Tensor, K: Tensor) -> P3PSolut
     check_correspondences(points_image, points_model, K, None)
     if points_image.shape[1] != 3:
         raise ValueError(f"P3P needs exactly 3 correspondences, got N = {points_image.shape[1]}")
-    # Hadamard's inequality bounds the determinant by the product of the rows' lengths.
-    bound = torch.linalg.vector_norm(K.detach(), dim=-1).prod(-1)
-    determinant = torch.linalg.det(K.detach()).abs()
-    invertible = torch.isfinite(bound) & (determinant > 8.0 * torch.finfo(K.dtype).eps * bound)
-    K = torch.where(invertible[:, None, None], K, torch.eye(3, dtype=K.dtype, device=K.device))
-    usable = usable_coordinates(points_image).all(-1) & invertible
-    pixels = torch.where(usable[:, None, None], points_image, torch.zeros_like(points_image))
-    # Written out, where pixel_rays has a matrix product whose rounding may depend on the batch size.
-    inverse = torch.linalg.inv(K).unsqueeze(1)
-    rays = inverse[..., 0] * pixels[..., :1] + inverse[..., 1] * pixels[..., 1:] + inverse[..., 2]
+    rays, usable = rays_of_usable_pixels(points_image, K)
+    rays = rays.masked_fill(~usable.all(-1)[:, None, None], 0.0)
     return solve_p3p_rays(rays, points_model)  # which flags three equal rays
 
 

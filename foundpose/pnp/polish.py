@@ -54,6 +54,15 @@ class LocalFrame(NamedTuple):
         t = self.origin + self.size * T_local[:, :3, 3] - (R @ self.centroid.unsqueeze(-1)).squeeze(-1)
         return make_transform(R, t)
 
+    def twist_to_camera(self) -> Tensor:
+        """Matrices (B, 6, 6) that turn twists (v, ω) of the local frame into the camera frame's; constants."""
+        origin, size = self.origin.detach(), self.size.detach()
+        identity = torch.eye(3, dtype=origin.dtype, device=origin.device).expand(len(origin), 3, 3)
+        # v at the local origin is size v + origin × ω at the camera's.
+        cross = torch.linalg.cross(origin.unsqueeze(-1).expand(-1, 3, 3), identity, dim=-2)
+        upper = torch.cat([size.unsqueeze(-1) * identity, cross], dim=-1)
+        return torch.cat([upper, torch.cat([torch.zeros_like(cross), identity], dim=-1)], dim=-2)
+
     def points(self, points_model: Tensor) -> Tensor:
         """Model points (B, N, 3) in units of this frame."""
         return (points_model - self.centroid.unsqueeze(-2)) / self.size.unsqueeze(-1)
@@ -193,33 +202,53 @@ def reprojection_equations(
         The normal equations of ``T_local ← exp(δ) @ T_local``; the cost is infinite where a weighted point
         lies behind the camera. Differentiable w.r.t. all tensors.
     """
-    rotated = transform_points(T_local, points_local)
-    points_camera = frame.origin.unsqueeze(-2) + frame.size.unsqueeze(-1) * rotated
-    x, y, depth = points_camera.unbind(-1)
+    pixels, depth, J = project_in_frame(T_local, points_local, K, frame)
     in_front = depth > 0
-    inverse = 1.0 / torch.where(in_front, depth, torch.ones_like(depth))
-    plane = torch.stack([x * inverse, y * inverse], dim=-1)
-    focal = K[:, None, :2, :2]
-    residual = (focal @ plane.unsqueeze(-1)).squeeze(-1) + K[:, None, :2, 2] - points_image
+    residual = pixels - points_image
     squared = residual.square().sum(-1)
     rho, slope = (squared, torch.ones_like(squared)) if loss is None else loss(squared)
     used = weights > 0
+    zero = torch.zeros_like(rho)
     # Points out of use may lie anywhere, also where their residual overflows.
-    cost = 0.5 * torch.where(used, weights * rho, torch.zeros_like(rho)).sum(-1)
+    cost = 0.5 * torch.where(used, weights * rho, zero).sum(-1)
     cost = cost.masked_fill((used & ~in_front).any(-1), torch.inf)
-
-    # d plane / d points_camera, then d points_camera / d δ = size [I, −[rotated]×].
-    zero = torch.zeros_like(inverse)
-    columns = [inverse, zero, -plane[..., 0] * inverse, zero, inverse, -plane[..., 1] * inverse]
-    by_point = focal @ torch.stack(columns, dim=-1).unflatten(-1, (2, 3)) * frame.size[..., None, None]
-    by_rotation = torch.linalg.cross(rotated.unsqueeze(-2).expand_as(by_point), by_point, dim=-1)
-    J = torch.cat([by_point, by_rotation], dim=-1)
     share = torch.where(used & in_front, weights * slope, zero)
     J_weighted = (J * share[..., None, None]).flatten(1, 2)
     J = J.flatten(1, 2)
     H = J_weighted.transpose(-1, -2) @ J
     g = (J_weighted.transpose(-1, -2) @ residual.flatten(1, 2).unsqueeze(-1)).squeeze(-1)
     return NormalEquations(cost, H, g)
+
+
+def project_in_frame(
+    T_local: Tensor, points_local: Tensor, K: Tensor, frame: LocalFrame
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Project ``frame.origin + frame.size * (T_local @ points_local)``, with derivatives.
+
+    Args:
+        T_local: (B, 4, 4).
+        points_local: (B, N, 3).
+        K: (B, 3, 3) intrinsics.
+        frame: where the local frame lies.
+
+    Returns:
+        Pixels (B, N, 2), depths (B, N) in mesh units, and the derivatives (B, N, 2, 6) of the pixels in δ for
+        ``T_local ← exp(δ) @ T_local``. Where the depth is not positive, pixels and derivatives are finite but mean
+        nothing. Differentiable w.r.t. all tensors.
+    """
+    rotated = transform_points(T_local, points_local)
+    points_camera = frame.origin.unsqueeze(-2) + frame.size.unsqueeze(-1) * rotated
+    x, y, depth = points_camera.unbind(-1)
+    inverse = 1.0 / torch.where(depth > 0, depth, torch.ones_like(depth))
+    plane = torch.stack([x * inverse, y * inverse], dim=-1)
+    focal = K[:, None, :2, :2]
+    pixels = (focal @ plane.unsqueeze(-1)).squeeze(-1) + K[:, None, :2, 2]
+    # d plane / d points_camera, then d points_camera / d δ = size [I, −[rotated]×].
+    zero = torch.zeros_like(inverse)
+    columns = [inverse, zero, -plane[..., 0] * inverse, zero, inverse, -plane[..., 1] * inverse]
+    by_point = focal @ torch.stack(columns, dim=-1).unflatten(-1, (2, 3)) * frame.size[..., None, None]
+    by_rotation = torch.linalg.cross(rotated.unsqueeze(-2).expand_as(by_point), by_point, dim=-1)
+    return pixels, depth, torch.cat([by_point, by_rotation], dim=-1)
 
 
 def check_correspondences(
@@ -248,3 +277,27 @@ def check_correspondences(
 def usable_coordinates(points: Tensor) -> Tensor:
     """Which points (..., d) are numbers whose fourth powers do not overflow: a bool mask (...)."""
     return (points.abs() < torch.finfo(points.dtype).max ** 0.25).all(-1)
+
+
+def rays_of_usable_pixels(points_image: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
+    """Rays through pixels, where there may be pixels that are no numbers and intrinsics without inverse.
+
+    Args:
+        points_image: (B, N, 2) pixels.
+        K: (B, 3, 3) intrinsics.
+
+    Returns:
+        Rays (B, N, 3) in the camera frame with z = 1, and which of them are of use (B, N). The others are fixed
+        numbers. Differentiable w.r.t. both arguments; what is not of use has a gradient of zero.
+    """
+    # Hadamard's inequality bounds the determinant by the product of the rows' lengths.
+    bound = torch.linalg.vector_norm(K.detach(), dim=-1).prod(-1)
+    determinant = torch.linalg.det(K.detach()).abs()
+    invertible = torch.isfinite(bound) & (determinant > 8.0 * torch.finfo(K.dtype).eps * bound)
+    K = torch.where(invertible[:, None, None], K, torch.eye(3, dtype=K.dtype, device=K.device))
+    usable = usable_coordinates(points_image) & invertible.unsqueeze(-1)
+    pixels = torch.where(usable.unsqueeze(-1), points_image, torch.zeros_like(points_image))
+    # Written out, where pixel_rays has a matrix product whose rounding may depend on the batch size.
+    inverse = torch.linalg.inv(K).unsqueeze(1)
+    rays = inverse[..., 0] * pixels[..., :1] + inverse[..., 1] * pixels[..., 1:] + inverse[..., 2]
+    return rays, usable

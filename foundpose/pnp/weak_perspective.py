@@ -25,10 +25,11 @@ def weak_perspective_depths(bearings: Tensor, points: Tensor, weights: Tensor) -
 
     Returns:
         (S, 2, N) distances from the camera centre, mirrored slopes along dimension 1; finite for any finite
-        input. Differentiable w.r.t. bearings and points away from fronto-parallel and edge-on views.
+        input. Starts for an optimisation: not differentiable.
 
     Source: scaled orthography as in DeMenthon and Davis, "Model-based object pose in 25 lines of code", 1995.
     """
+    bearings, points, weights = bearings.detach(), points.detach(), weights.detach()
     eps = torch.finfo(points.dtype).eps
     column = weights.unsqueeze(-1)
     mean = (column * bearings).sum(-2)

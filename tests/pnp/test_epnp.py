@@ -2,8 +2,9 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
-from foundpose.pnp import polish_pnp, solve_epnp
+from foundpose.pnp import MinimalSolution, polish_pnp, solve_epnp
 from tests.pnp.scenes import make_scene, pose_errors, stack
 
 SHAPES = ["volume", "ellipsoid", "plane"]
@@ -206,3 +207,196 @@ def test_bad_input() -> None:
         solve_epnp(image, model, K, torch.ones(2, 5))
     with pytest.raises(ValueError, match="float16"):
         solve_epnp(image.half(), model.half(), K.half())
+
+
+def noisy_problem(points: int, shape: str, seed: int, sigma: float = 0.1) -> list[Tensor]:
+    """Image and model points in hundreds of pixels and millimetres, intrinsics and weights; all of order one."""
+    image, model, K, _ = stack(scenes_of(1, points, shape, True, seed=seed), torch.float64)
+    g = torch.Generator().manual_seed(seed)
+    image = image + sigma * torch.randn(image.shape, generator=g, dtype=torch.float64)
+    weights = 0.5 + torch.rand(1, points, generator=g, dtype=torch.float64)
+    units = torch.diag(torch.tensor([0.01, 0.01, 1.0], dtype=torch.float64))
+    return [image / 100.0, model / 100.0, units @ K, weights]
+
+
+def intrinsics(parameters: Tensor) -> Tensor:
+    """(B, 5) focal lengths, skew and principal point → (B, 3, 3)."""
+    zero, one = torch.zeros_like(parameters[:, 0]), torch.ones_like(parameters[:, 0])
+    fx, fy, skew, cx, cy = parameters.unbind(-1)
+    return torch.stack([fx, skew, cx, zero, fy, cy, zero, zero, one], dim=-1).unflatten(-1, (3, 3))
+
+
+@pytest.mark.parametrize(
+    ("points", "shape"),
+    [(4, "volume"), (4, "plane"), (5, "plane"), (8, "volume"), (8, "plane"), (20, "volume")],
+)
+def test_gradients_agree_with_finite_differences(points: int, shape: str) -> None:
+    image, model, K, weights = noisy_problem(points, shape, seed=2)
+    parameters = torch.stack([K[:, 0, 0], K[:, 1, 1], K[:, 0, 1], K[:, 0, 2], K[:, 1, 2]], dim=-1)
+    # Out of its plane an exactly flat object has other solutions at once: only motion inside is smooth.
+    moving = 3 if shape == "volume" or points == 4 else 2
+
+    def pose(image: Tensor, moved: Tensor, parameters: Tensor, weights: Tensor | None = None) -> Tensor:
+        points_model = torch.cat([moved, model[..., moving:]], dim=-1)
+        return solve_epnp(image, points_model, intrinsics(parameters), weights).T_camera_from_model[:, :3]
+
+    # The refinement stops after five steps, so the gradient of the optimum differs a little from that of the steps.
+    def check(inputs: list[Tensor]) -> bool:
+        inputs = [x.clone().requires_grad_() for x in inputs]
+        return torch.autograd.gradcheck(pose, inputs, eps=1e-6, atol=1e-4, rtol=1e-3)
+
+    inputs = [image, model[..., :moving], parameters]
+    assert check(inputs if points == 4 else [*inputs, weights])
+
+
+@pytest.mark.parametrize("points", [4, 6, 12])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_most_gradients_agree_with_finite_differences_under_noise(points: int, shape: str) -> None:
+    scenes = scenes_of(200, points, shape, False, seed=7)
+    image, model, K, _ = stack(scenes, torch.float64)
+    g = torch.Generator().manual_seed(0)
+    image = image + 0.5 * torch.randn(image.shape, generator=g, dtype=torch.float64)
+    direction = torch.randn(image.shape, generator=g, dtype=torch.float64)
+    cotangent = torch.randn(200, 3, 3, generator=g, dtype=torch.float64)
+
+    def values(image: Tensor) -> Tensor:
+        return (solve_epnp(image, model, K).T_camera_from_model[:, :3, :3] * cotangent).sum((1, 2))
+
+    image.requires_grad_()
+    (grad,) = torch.autograd.grad(values(image).sum(), image)
+    analytic = (grad * direction).sum((1, 2))
+    step = 1e-5 * direction
+    numeric = (values(image.detach() + step) - values(image.detach() - step)) / 2e-5
+    close = (analytic - numeric).abs() <= 1e-3 * (numeric.abs() + numeric.abs().median())
+    assert close.double().mean() >= 0.85
+
+
+HARD_CASES = {
+    # Name: whether it is degenerate.
+    "identity": False,
+    "half turn": False,
+    "coplanar": False,
+    "square": False,
+    "cross": False,
+    "zero weight": False,
+    "negative weight": False,
+    "noise": False,
+    "collinear": True,
+    "coincident": True,
+    "at origin": True,
+    "same pixel": True,
+    "too few": True,
+    "NaN image": True,
+    "infinite model": True,
+    "NaN weight": True,
+    "NaN K": True,
+    "singular K": True,
+    "zero K": True,
+}
+
+
+def hard_case(name: str, points: int, dtype: torch.dtype) -> tuple[list[Tensor], bool]:
+    """One problem as image points, model points, intrinsics and weights, and whether it is degenerate."""
+    g = torch.Generator().manual_seed(points)
+    model = torch.rand(1, points, 3, generator=g, dtype=torch.float64) * 100.0 - 50.0
+    R = torch.eye(3, dtype=torch.float64)
+    angle = torch.arange(points, dtype=torch.float64) * 2.0 * torch.pi / points
+    circle = torch.stack([50.0 * angle.cos(), 50.0 * angle.sin(), 0.0 * angle], dim=-1)
+    if name == "half turn":
+        R = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
+    elif name == "coplanar":
+        model[..., 2] = 0.0
+    elif name == "square":
+        model = circle[None]
+    elif name == "cross":  # tetrahedron or antiprism: repeated principal axes
+        model = circle[None].clone()
+        model[:, ::2, 2], model[:, 1::2, 2] = 20.0, -20.0
+    elif name == "collinear":
+        model = model[:, :1] * torch.linspace(-1.0, 1.0, points, dtype=torch.float64)[None, :, None]
+    elif name in ("coincident", "at origin"):
+        model = (model[:, :1] * (name == "coincident")).repeat(1, points, 1)
+    K = torch.tensor([[[600.0, 0.0, 210.0], [0.0, 600.0, 210.0], [0.0, 0.0, 1.0]]], dtype=torch.float64)
+    camera = model @ R.T + torch.tensor([3.0, -5.0, 400.0], dtype=torch.float64)
+    image = (camera @ K.mT)[..., :2] / camera[..., 2:]
+    weights = torch.ones(1, points, dtype=torch.float64)
+    degenerate = HARD_CASES[name]
+    few = 5 if points > 5 else 0  # where one point less still leaves four of a non-degenerate problem
+    if name in ("zero weight", "negative weight"):
+        weights[0, -1] = -1.0 if name == "negative weight" else 0.0
+        degenerate = points == 4
+    elif name == "noise":
+        image = image + torch.randn(image.shape, generator=g, dtype=torch.float64)
+    elif name == "same pixel":
+        image = image[:, :1].repeat(1, points, 1)
+    elif name == "too few":
+        weights[:, 3:] = 0.0
+    elif name in ("NaN image", "infinite model", "NaN weight"):
+        gone = slice(0, None if not few else 1)
+        if name == "NaN image":
+            image[0, gone] = torch.nan
+        elif name == "infinite model":
+            model[0, gone, 1] = torch.inf
+        else:
+            weights[0, gone] = torch.nan
+        degenerate = not few
+    elif name == "NaN K":
+        K[:] = torch.nan
+    elif name == "singular K":
+        K[:, 0, 0] = 0.0
+    elif name == "zero K":
+        K[:] = 0.0
+    return [x.to(dtype) for x in (image, model, K, weights)], degenerate
+
+
+def gradients(inputs: list[Tensor]) -> tuple[MinimalSolution, list[Tensor]]:
+    inputs = [x.clone().requires_grad_() for x in inputs]
+    solution = solve_epnp(*inputs)
+    T = solution.T_camera_from_model
+    factors = torch.linspace(0.5, 2.0, 16, dtype=T.dtype).view(4, 4)
+    grads = torch.autograd.grad((T * factors).sum(), inputs, allow_unused=True)
+    return solution, [torch.zeros_like(x) if g is None else g for x, g in zip(inputs, grads, strict=True)]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("points", [4, 5, 6, 12])
+@pytest.mark.parametrize("name", HARD_CASES)
+def test_gradients_of_hard_cases(name: str, points: int, dtype: torch.dtype) -> None:
+    inputs, degenerate = hard_case(name, points, dtype)
+    solution, grads = gradients(inputs)
+    assert solution.degenerate.item() == degenerate
+    assert solution.valid.item() == (not degenerate)
+    assert torch.isfinite(solution.T_camera_from_model).all()
+    for x, grad in zip(inputs, grads, strict=True):
+        assert torch.isfinite(grad).all()
+        if degenerate:
+            assert (grad == 0).all()
+        # No smooth branch of a well-posed problem is as steep.
+        assert (grad.abs() * x.abs().nan_to_num(0.0, 0.0, 0.0)).max() < 1e9
+    if not degenerate:
+        assert all(grad.abs().max() > 0 for grad in grads[:3])
+    ignored = ~(inputs[3] > 0) | ~torch.isfinite(inputs[0]).all(-1) | ~torch.isfinite(inputs[1]).all(-1)
+    assert all((grads[i][ignored] == 0).all() for i in (0, 1, 3))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("points", [4, 6])
+def test_gradients_do_not_depend_on_neighbours(points: int, dtype: torch.dtype) -> None:
+    """Not even on degenerate ones."""
+    cases = [hard_case(name, points, dtype)[0] for name in HARD_CASES]
+    together = gradients([torch.cat(parts) for parts in zip(*cases, strict=True)])[1]
+    for i, (name, case) in enumerate(zip(HARD_CASES, cases, strict=True)):
+        # Symmetric objects have no axes of their own: rounding decides.
+        if name in ("identity", "half turn", "noise", "zero weight") or HARD_CASES[name]:
+            for whole, alone in zip(together, gradients(case)[1], strict=True):
+                scale = alone.abs().max().item()
+                torch.testing.assert_close(
+                    whole[i : i + 1], alone, rtol=0.0, atol=1e4 * torch.finfo(dtype).eps * scale
+                )
+
+
+@pytest.mark.parametrize("points", [4, 5, 9])
+def test_gradients_do_not_change_values(points: int) -> None:
+    image, model, K, _ = stack(scenes_of(100, points, "volume", False), torch.float32)
+    plain = solve_epnp(image, model, K).T_camera_from_model
+    assert not plain.requires_grad
+    assert torch.equal(solve_epnp(image.requires_grad_(), model, K).T_camera_from_model, plain)

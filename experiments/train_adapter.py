@@ -1,0 +1,182 @@
+"""Train an adapter on frozen descriptors by the error of the poses they lead to; measure an unseen object's poses.
+
+python experiments/train_adapter.py
+python experiments/train_adapter.py meshes=[a.ply,b.ply,c.ply] held_out=d.ply
+"""
+
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import hydra
+import pytorch_lightning as pl
+from hydra.core.hydra_config import HydraConfig
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+from pytorch_lightning.callbacks import ModelCheckpoint
+from pytorch_lightning.loggers import CSVLogger
+from safetensors.torch import load_file, save_file
+
+from foundpose.config import build_method, claim_run_folder, clear_errors
+from foundpose.features import ResidualAdapter
+from foundpose.io import write_atomically
+from foundpose.progress import ProgressBars
+from foundpose.rendering import Mesh, load_mesh
+from foundpose.synthetic import procedural_mesh
+from foundpose.training import PairDataModule, PoseErrors, compare, evaluate_scenes, summarize
+
+# Settings that may change when a run is resumed; with more epochs in trainer it trains on.
+MAY_CHANGE = ("device", "representations", "trainer")
+# Procedural objects are numbered from here; scenes of the held-out object are like no scene trained on.
+TRAINING_OBJECTS, VALIDATION_OBJECTS, HELD_OUT_SCENES = 1000, 2000, 10_000
+MODES = ("retrieved", "nearest")
+
+_T = TypeVar("_T")
+
+
+@hydra.main(version_base="1.3", config_path="../conf", config_name="train_adapter")
+def main(cfg: DictConfig) -> None:
+    """Measure, train, measure again; writes the adapter, the results and Lightning's checkpoints and logs."""
+    with clear_errors():
+        run(cfg, Path(HydraConfig.get().runtime.output_dir))
+
+
+def run(cfg: DictConfig, output: Path) -> None:
+    """What :func:`main` does, in a folder; what is there already is not done again."""
+    held_out = load_mesh(cfg.held_out) if cfg.held_out is not None else small_mesh(cfg.held_out_seed)
+    meshes = wanted_meshes(cfg, "meshes", TRAINING_OBJECTS)
+    validation = wanted_meshes(cfg, "validation", VALIDATION_OBJECTS)
+    if held_out.checksum in {mesh.checksum for mesh in (*meshes, *validation)}:
+        raise ValueError(
+            "the held-out object is among those trained on; give another held_out or held_out_seed"
+        )
+    claim_run_folder(output, cfg, MAY_CHANGE)
+    pl.seed_everything(cfg.seed, verbose=False)
+    seconds: dict[str, float] = {}
+
+    before = timed(seconds, "before", lambda: measure(cfg, held_out, output / "before.safetensors", "before"))
+    timed(seconds, "training", lambda: train(cfg, meshes, validation, output))
+    trained = cfg.copy()
+    trained.extractor = {
+        "_target_": "foundpose.features.AdaptedExtractor",
+        "extractor": cfg.extractor,
+        "adapter": None,
+        "weights": str(output / "adapter.safetensors"),
+    }
+    after = timed(seconds, "after", lambda: measure(trained, held_out, None, "after"))
+
+    results = {
+        mode: {
+            "before": summarize(before[mode]),
+            "after": summarize(after[mode]),
+            "change": compare(before[mode], after[mode]),
+        }
+        for mode in MODES
+    }
+    facts = {"results": results, "seconds": seconds, "settings": OmegaConf.to_container(cfg, resolve=True)}
+    write_atomically(
+        output / "results.json", lambda temporary: temporary.write_text(json.dumps(facts, indent=1))
+    )
+    print_table(results)
+    print("seconds: " + ", ".join(f"{name} {value:.0f}" for name, value in seconds.items()))
+    print(f"adapter: {output / 'adapter.safetensors'}")
+
+
+def wanted_meshes(cfg: DictConfig, name: str, first: int) -> list[Mesh]:
+    """Meshes from files, or so many procedural ones."""
+    value = OmegaConf.to_container(cfg[name]) if OmegaConf.is_list(cfg[name]) else cfg[name]
+    if isinstance(value, list):
+        return [load_mesh(file) for file in value]
+    if not isinstance(value, int) or value < 0:
+        raise ValueError(
+            f"{name} must be a list of mesh files or a number of procedural objects, got {value!r}"
+        )
+    return [small_mesh(first + i) for i in range(value)]
+
+
+def small_mesh(seed: int) -> Mesh:
+    """A procedural object of 10 k vertices."""
+    return procedural_mesh(seed, subdivisions=5)
+
+
+def timed(seconds: dict[str, float], name: str, step: Callable[[], _T]) -> _T:
+    """Run a step and note how long it took."""
+    start = time.perf_counter()
+    result = step()
+    seconds[name] = time.perf_counter() - start
+    return result
+
+
+def measure(cfg: DictConfig, mesh: Mesh, kept: Path | None, title: str) -> dict[str, PoseErrors]:
+    """Onboard the held-out object and estimate its pose in all scenes, or read the errors that were kept."""
+    if kept is not None and kept.is_file():
+        tensors = load_file(kept)
+        return {
+            mode: PoseErrors(*(tensors[f"{mode}.{field}"] for field in PoseErrors._fields)) for mode in MODES
+        }
+    method = build_method(cfg)
+    representation = method.store.get(mesh, "held-out", ProgressBars(title)).to(cfg.device)
+    errors = evaluate_scenes(
+        method.pipeline,
+        representation,
+        mesh,
+        [HELD_OUT_SCENES + k for k in range(cfg.scenes)],
+        method.onboarder.renderer,
+        instantiate(cfg.light),
+        cfg.pairs.occlusion,
+        progress=ProgressBars(title),
+    )
+    if kept is not None:
+        flat = {f"{mode}.{field}": value for mode in MODES for field, value in errors[mode]._asdict().items()}
+        write_atomically(kept, lambda temporary: save_file(flat, str(temporary)))
+    return errors
+
+
+def train(cfg: DictConfig, meshes: list[Mesh], validation: list[Mesh], output: Path) -> None:
+    """Train and write the adapter; goes on from the last checkpoint in the folder."""
+    method = build_method(cfg)
+    method.onboarder.extractor.requires_grad_(False)
+    data = PairDataModule(
+        meshes,
+        validation,
+        method.onboarder,
+        method.pipeline.crop,
+        instantiate(cfg.pairs),
+        cfg.batch_size,
+        cfg.seed,
+        output / "pairs",
+        ProgressBars("train"),
+    )
+    adapter: ResidualAdapter = instantiate(cfg.adapter, channels=method.onboarder.extractor.channels)
+    module = instantiate(cfg.training, adapter=adapter)
+    checkpoint = ModelCheckpoint(dirpath=output / "checkpoints", save_last=True)
+    trainer: pl.Trainer = instantiate(
+        cfg.trainer, default_root_dir=output, logger=CSVLogger(output, name="log"), callbacks=[checkpoint]
+    )
+    last = output / "checkpoints" / "last.ckpt"
+    trainer.fit(module, datamodule=data, ckpt_path=str(last) if last.is_file() else None)
+    adapter.cpu().save(output / "adapter.safetensors")
+
+
+def print_table(results: dict[str, dict[str, Any]]) -> None:
+    """Before and after, with the change and its standard error."""
+    print(f"{'templates':<11}{'':<8}{'right':>7}{'median rotation':>17}{'matching error / diameter':>27}")
+    for mode, rows in results.items():
+        for stage in ("before", "after"):
+            row = rows[stage]
+            print(
+                f"{mode:<11}{stage:<8}{row['right']:>7.1%}{row['median_rotation_degrees']:>16.2f}°"
+                f"{row['mean_matching_error']:>27.3f}"
+            )
+        change = rows["change"]
+        print(
+            f"{mode:<11}{'change':<8}{change['right']:>+7.1%} ± {change['right_standard_error']:.1%}, "
+            f"{change['gained']} poses gained, {change['lost']} lost; matching error "
+            f"{change['mean_matching_error']:+.3f} ± {change['matching_standard_error']:.3f}"
+        )
+
+
+if __name__ == "__main__":
+    main()

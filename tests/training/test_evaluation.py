@@ -1,0 +1,103 @@
+import math
+
+import pytest
+import torch
+
+from foundpose.geometry import PerspectiveCrop, make_transform
+from foundpose.matching import PatchMatcher
+from foundpose.pipeline import FoundPose
+from foundpose.pnp import RansacPnp
+from foundpose.retrieval import QueryPatches, TemplateRetriever
+from foundpose.training import PoseErrors, compare, evaluate_scenes, summarize
+from foundpose.training.evaluation import GivenTemplates, pose_errors
+
+
+def turn(degrees):
+    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    return torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def test_pose_errors_of_known_poses(bodies):
+    mesh = bodies[0]
+    truth = make_transform(torch.eye(3), torch.tensor([0.0, 0.0, 500.0])).expand(5, 4, 4)
+    off = torch.tensor([0.0, 9.0, 11.0, 0.0, 0.0])
+    shift = torch.tensor([0.0, 0.0, 0.0, 0.2, 0.0]) * float(mesh.diameter)
+    estimates = torch.stack(
+        [
+            make_transform(turn(a), torch.tensor([float(d), 0.0, 500.0]))
+            for a, d in zip(off, shift, strict=True)
+        ]
+    )
+    errors = pose_errors(estimates, torch.tensor([True, True, True, True, False]), truth, mesh)
+    assert errors.right.tolist() == [True, True, False, False, False]
+    assert torch.allclose(errors.rotation, torch.tensor([0.0, 9.0, 11.0, 0.0, 180.0]), atol=0.05)
+    assert torch.allclose(errors.translation, torch.tensor([0.0, 0.0, 0.0, 0.2, torch.inf]), atol=1e-5)
+    # A shift moves every point by itself; a turn by the chord at the mean distance from the axis.
+    radius = mesh.vertices[:: len(mesh.vertices) // 1000, :2].norm(dim=1).mean() / mesh.diameter
+    chord = 2 * math.sin(math.radians(4.5)) * radius
+    wanted = torch.tensor([0.0, chord, 0.2, 1.0])
+    assert torch.allclose(errors.matching[[0, 1, 3, 4]], wanted, atol=1e-4)
+
+
+def errors_of(rotation, matching):
+    rotation = torch.tensor(rotation)
+    return PoseErrors(rotation, torch.zeros(len(rotation)), torch.tensor(matching), rotation < 10)
+
+
+def test_summary_and_paired_comparison():
+    before = errors_of([1.0, 20.0, 30.0, 2.0], [0.1, 0.5, 0.9, 0.1])
+    after = errors_of([1.0, 2.0, 3.0, 25.0], [0.1, 0.1, 0.2, 0.4])
+    summary = summarize(after)
+    assert summary["scenes"] == 4
+    assert summary["right"] == 0.75
+    assert summary["right_standard_error"] == pytest.approx(math.sqrt(0.75 * 0.25 / 4))
+    assert summary["mean_matching_error"] == pytest.approx(0.2)
+    change = compare(before, after)
+    assert (change["gained"], change["lost"]) == (2, 1)
+    assert change["right"] == 0.25
+    difference = [0.0, 1.0, 1.0, -1.0]
+    deviation = math.sqrt(sum((d - 0.25) ** 2 for d in difference) / 4)
+    assert change["right_standard_error"] == pytest.approx(deviation / 2)
+    assert change["mean_matching_error"] == pytest.approx(-0.2)
+    with pytest.raises(ValueError, match="4 and 1 scenes"):
+        compare(before, errors_of([1.0], [0.1]))
+
+
+def test_scenes_with_retrieved_and_with_nearest_templates(bodies, sift_onboarder):
+    mesh = bodies[1]
+    representation = sift_onboarder(mesh, "body")
+    pipeline = FoundPose(
+        PerspectiveCrop(280),
+        sift_onboarder.extractor,
+        TemplateRetriever(sift_onboarder.bow, 2),
+        PatchMatcher(),
+        RansacPnp(iterations=100),
+    ).eval()
+    seeds = [4, 7, 9]
+    steps = []
+    errors = evaluate_scenes(
+        pipeline,
+        representation,
+        mesh,
+        seeds,
+        sift_onboarder.renderer,
+        batch_size=2,
+        progress=lambda stage, done, total: steps.append((done, total)),
+    )
+    assert steps == [(2, 3), (3, 3)]
+    alone = evaluate_scenes(pipeline, representation, mesh, [9], sift_onboarder.renderer)
+    for mode in ("retrieved", "nearest"):
+        assert errors[mode].rotation.shape == (3,)
+        assert torch.allclose(errors[mode].rotation[2:], alone[mode].rotation, atol=0.5)
+
+
+def test_given_templates(sift_onboarder):
+    given = GivenTemplates(TemplateRetriever(sift_onboarder.bow))
+    valid = torch.tensor([[True, False], [False, False]])
+    query = QueryPatches(torch.zeros(2, 2, 4), torch.zeros(2, 2, 2), valid)
+    with pytest.raises(ValueError, match="given for 0 crops, there are 2"):
+        given(query, None)
+    given.index = torch.tensor([[5], [6]])
+    found = given(query, None)
+    assert found.index.tolist() == [[5], [6]]
+    assert found.valid.tolist() == [[True], [False]]
