@@ -2,13 +2,16 @@
 
 python experiments/train_adapter.py
 python experiments/train_adapter.py meshes=[a.ply,b.ply,c.ply] held_out=d.ply
+python experiments/demo.py --config-dir outputs/train_adapter extractor=adapted
 """
 
 import json
+import re
 import time
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import hydra
 import pytorch_lightning as pl
@@ -21,19 +24,27 @@ from safetensors.torch import load_file, save_file
 
 from foundpose.config import build_method, claim_run_folder, clear_errors
 from foundpose.features import ResidualAdapter
+from foundpose.geometry import Symmetries, stack_symmetries, symmetries_from_models_info
 from foundpose.io import write_atomically
 from foundpose.progress import ProgressBars
 from foundpose.rendering import Mesh, load_mesh
 from foundpose.synthetic import procedural_mesh
-from foundpose.training import PairDataModule, PoseErrors, compare, evaluate_scenes, summarize
+from foundpose.training import (
+    AdapterTraining,
+    PairDataModule,
+    PoseErrors,
+    compare,
+    evaluate_scenes,
+    summarize,
+)
 
 # Settings that may change when a run is resumed; with more epochs in trainer it trains on.
 MAY_CHANGE = ("device", "representations", "trainer")
 # Procedural objects are numbered from here; scenes of the held-out object are like no scene trained on.
 TRAINING_OBJECTS, VALIDATION_OBJECTS, HELD_OUT_SCENES = 1000, 2000, 10_000
 MODES = ("retrieved", "nearest")
-
-_T = TypeVar("_T")
+# What an option of the config group extractor sets.
+EXTRACTOR_SETTINGS = ("extractor", "sigma", "temperature", "residual", "residual_scale")
 
 
 @hydra.main(version_base="1.3", config_path="../conf", config_name="train_adapter")
@@ -44,7 +55,11 @@ def main(cfg: DictConfig) -> None:
 
 
 def run(cfg: DictConfig, output: Path) -> None:
-    """What :func:`main` does, in a folder; what is there already is not done again."""
+    """What :func:`main` does, in a folder.
+
+    What is there already is not done again: the pairs, the measurement before, the epochs trained, and the
+    measurement after of the adapter that came out. Times are those of all parts of the run together.
+    """
     held_out = load_mesh(cfg.held_out) if cfg.held_out is not None else small_mesh(cfg.held_out_seed)
     meshes = wanted_meshes(cfg, "meshes", TRAINING_OBJECTS)
     validation = wanted_meshes(cfg, "validation", VALIDATION_OBJECTS)
@@ -52,20 +67,20 @@ def run(cfg: DictConfig, output: Path) -> None:
         raise ValueError(
             "the held-out object is among those trained on; give another held_out or held_out_seed"
         )
+    symmetries = {name: wanted_symmetries(cfg, name) for name in ("held_out", "meshes", "validation")}
     claim_run_folder(output, cfg, MAY_CHANGE)
     pl.seed_everything(cfg.seed, verbose=False)
-    seconds: dict[str, float] = {}
-
-    before = timed(seconds, "before", lambda: measure(cfg, held_out, output / "before.safetensors", "before"))
-    timed(seconds, "training", lambda: train(cfg, meshes, validation, output))
-    trained = cfg.copy()
-    trained.extractor = {
-        "_target_": "foundpose.features.AdaptedExtractor",
-        "extractor": cfg.extractor,
-        "adapter": None,
-        "weights": str(output / "adapter.safetensors"),
-    }
-    after = timed(seconds, "after", lambda: measure(trained, held_out, None, "after"))
+    clock = Clock(output / "seconds.json")
+    with clock("before"):
+        before = measure(cfg, held_out, symmetries["held_out"], output / "before.safetensors", "before")
+    with clock("training"):
+        module = train(cfg, meshes, validation, symmetries, output)
+    module.adapter.save(output / "adapter.safetensors")
+    trained = with_adapter(cfg, module, output / "adapter.safetensors")
+    write_extractor(trained, output / "extractor" / "adapted.yaml")
+    with clock("after"):
+        kept = output / f"after-{module.adapter.checksum()}.safetensors"
+        after = measure(trained, held_out, symmetries["held_out"], kept, "after")
 
     results = {
         mode: {
@@ -75,13 +90,17 @@ def run(cfg: DictConfig, output: Path) -> None:
         }
         for mode in MODES
     }
-    facts = {"results": results, "seconds": seconds, "settings": OmegaConf.to_container(cfg, resolve=True)}
+    facts = {
+        "results": results,
+        "seconds": clock.seconds,
+        "settings": OmegaConf.to_container(cfg, resolve=True),
+    }
     write_atomically(
         output / "results.json", lambda temporary: temporary.write_text(json.dumps(facts, indent=1))
     )
     print_table(results)
-    print("seconds: " + ", ".join(f"{name} {value:.0f}" for name, value in seconds.items()))
-    print(f"adapter: {output / 'adapter.safetensors'}")
+    print("seconds: " + ", ".join(f"{name} {value:.0f}" for name, value in clock.seconds.items()))
+    print(f"adapter: {output / 'adapter.safetensors'}; in every app: --config-dir {output} extractor=adapted")
 
 
 def wanted_meshes(cfg: DictConfig, name: str, first: int) -> list[Mesh]:
@@ -101,17 +120,72 @@ def small_mesh(seed: int) -> Mesh:
     return procedural_mesh(seed, subdivisions=5)
 
 
-def timed(seconds: dict[str, float], name: str, step: Callable[[], _T]) -> _T:
-    """Run a step and note how long it took."""
-    start = time.perf_counter()
-    result = step()
-    seconds[name] = time.perf_counter() - start
-    return result
+def wanted_symmetries(cfg: DictConfig, name: str) -> Symmetries | None:
+    """Symmetries of meshes, from BOP's ``models_info.json``; None without one, and for procedural objects."""
+    files = [cfg[name]] if isinstance(cfg[name], str) else cfg[name]
+    if cfg.models_info is None or files is None or isinstance(files, int):
+        return None
+    entries = {int(key): entry for key, entry in json.loads(Path(cfg.models_info).read_text()).items()}
+    found = []
+    for file in files:
+        number = re.fullmatch(r"obj_(\d+)", Path(file).stem)
+        if number is None or int(number[1]) not in entries:
+            raise ValueError(
+                f"{cfg.models_info} tells of the objects {sorted(entries)}; which of them is {file}? "
+                "Name it obj_000001.ply as BOP does, or leave models_info out"
+            )
+        found.append(symmetries_from_models_info(entries[int(number[1])]))
+    return stack_symmetries(found) if found else None
 
 
-def measure(cfg: DictConfig, mesh: Mesh, kept: Path | None, title: str) -> dict[str, PoseErrors]:
+class Clock:
+    """Adds up the time spent on each step, over all parts of a run.
+
+    Args:
+        path: file that keeps the sums.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.seconds: dict[str, float] = json.loads(path.read_text()) if path.is_file() else {}
+
+    @contextmanager
+    def __call__(self, name: str) -> Iterator[None]:
+        """Add the time spent inside."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:  # the part before an interruption counts too
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+            text = json.dumps(self.seconds)
+            write_atomically(self.path, lambda temporary: temporary.write_text(text))
+
+
+def with_adapter(cfg: DictConfig, module: AdapterTraining, weights: Path) -> DictConfig:
+    """The same settings with the adapter around the extractor, and the temperature that it was trained with."""
+    trained = cfg.copy()
+    trained.extractor = {
+        "_target_": "foundpose.features.AdaptedExtractor",
+        "extractor": cfg.extractor,
+        "adapter": None,
+        "weights": str(weights.resolve()),
+    }
+    trained.temperature = float(module.matcher.temperature.detach())
+    return trained
+
+
+def write_extractor(cfg: DictConfig, path: Path) -> None:
+    """Write an option of the config group ``extractor``, for the apps that are told of its folder."""
+    option = {name: cfg[name] for name in EXTRACTOR_SETTINGS}
+    text = "# @package _global_\n" + OmegaConf.to_yaml(OmegaConf.create(option), resolve=True)
+    write_atomically(path, lambda temporary: temporary.write_text(text))
+
+
+def measure(
+    cfg: DictConfig, mesh: Mesh, symmetries: Symmetries | None, kept: Path, title: str
+) -> dict[str, PoseErrors]:
     """Onboard the held-out object and estimate its pose in all scenes, or read the errors that were kept."""
-    if kept is not None and kept.is_file():
+    if kept.is_file():
         tensors = load_file(kept)
         return {
             mode: PoseErrors(*(tensors[f"{mode}.{field}"] for field in PoseErrors._fields)) for mode in MODES
@@ -127,15 +201,21 @@ def measure(cfg: DictConfig, mesh: Mesh, kept: Path | None, title: str) -> dict[
         instantiate(cfg.light),
         cfg.pairs.occlusion,
         progress=ProgressBars(title),
+        symmetries=symmetries,
     )
-    if kept is not None:
-        flat = {f"{mode}.{field}": value for mode in MODES for field, value in errors[mode]._asdict().items()}
-        write_atomically(kept, lambda temporary: save_file(flat, str(temporary)))
+    flat = {f"{mode}.{field}": value for mode in MODES for field, value in errors[mode]._asdict().items()}
+    write_atomically(kept, lambda temporary: save_file(flat, str(temporary)))
     return errors
 
 
-def train(cfg: DictConfig, meshes: list[Mesh], validation: list[Mesh], output: Path) -> None:
-    """Train and write the adapter; goes on from the last checkpoint in the folder."""
+def train(
+    cfg: DictConfig,
+    meshes: list[Mesh],
+    validation: list[Mesh],
+    symmetries: dict[str, Symmetries | None],
+    output: Path,
+) -> AdapterTraining:
+    """Train; goes on from the last checkpoint in the folder."""
     method = build_method(cfg)
     method.onboarder.extractor.requires_grad_(False)
     data = PairDataModule(
@@ -148,16 +228,18 @@ def train(cfg: DictConfig, meshes: list[Mesh], validation: list[Mesh], output: P
         cfg.seed,
         output / "pairs",
         ProgressBars("train"),
+        symmetries["meshes"],
+        symmetries["validation"],
     )
     adapter: ResidualAdapter = instantiate(cfg.adapter, channels=method.onboarder.extractor.channels)
-    module = instantiate(cfg.training, adapter=adapter)
+    module: AdapterTraining = instantiate(cfg.training, adapter=adapter)
     checkpoint = ModelCheckpoint(dirpath=output / "checkpoints", save_last=True)
     trainer: pl.Trainer = instantiate(
         cfg.trainer, default_root_dir=output, logger=CSVLogger(output, name="log"), callbacks=[checkpoint]
     )
     last = output / "checkpoints" / "last.ckpt"
     trainer.fit(module, datamodule=data, ckpt_path=str(last) if last.is_file() else None)
-    adapter.cpu().save(output / "adapter.safetensors")
+    return module.cpu()
 
 
 def print_table(results: dict[str, dict[str, Any]]) -> None:

@@ -5,6 +5,8 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
+from foundpose.optimization.derivatives import eigenbasis
+
 _ROWS_PER_BLOCK = 8192
 
 
@@ -97,7 +99,7 @@ def principal_components(covariance: Tensor, num_components: int) -> tuple[Tenso
     Raises:
         ValueError: If the covariance is not finite or zero.
 
-    Differentiable w.r.t. ``covariance`` where its eigenvalues differ.
+    Differentiable (once) w.r.t. ``covariance``; directions whose variances agree do not turn into each other.
     """
     channels = covariance.shape[0]
     if covariance.shape != (channels, channels):
@@ -108,7 +110,7 @@ def principal_components(covariance: Tensor, num_components: int) -> tuple[Tenso
         )
     if not bool(torch.isfinite(covariance).all()):
         raise ValueError("the covariance has NaN or infinite entries: check the descriptors it was made of")
-    variances, vectors = torch.linalg.eigh(covariance)
+    variances, vectors = eigenbasis(covariance)
     variances, components = variances.flip(0), vectors.flip(1).T
     if not bool(variances[0] > 0):
         raise ValueError(

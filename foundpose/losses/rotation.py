@@ -18,7 +18,7 @@ def geodesic_rotation_error(
 
     Args:
         T_est: (B, 4, 4) estimated poses, or (B, 3, 3) rotations.
-        T_true: true ones, of the same shape.
+        T_true: true ones, of the same shape; rotations may be scaled (BOP's are, by up to 1.005).
         symmetries: :class:`Symmetries` of the B objects, of which the rotations count; None for none.
         valid: (B,) bool; the error of a sample that is not valid is 0, with zero gradient, whatever its poses hold.
 
@@ -43,7 +43,7 @@ def geodesic_rotation_error(
         )
         a, b = R_est.detach(), R_true.detach()
         S = best_symmetry(
-            lambda S: rotation_angle(a[:, None], b[:, None] @ S[..., :3, :3]),
+            lambda S: rotation_angle(_unit_scale(a)[:, None], _unit_scale(b)[:, None] @ S[..., :3, :3]),
             turns,
             nearest_axis_angles(
                 _without_translation(a),
@@ -55,8 +55,13 @@ def geodesic_rotation_error(
             refine=False,
         )
         R_true = R_true @ keep_valid(valid, S[:, :3, :3], eye)
-    angles = rotation_angle(R_est, R_true)
+    angles = rotation_angle(_unit_scale(R_est), _unit_scale(R_true))
     return keep_valid(valid, angles, torch.zeros_like(angles))
+
+
+def _unit_scale(R: Tensor) -> Tensor:
+    """Take a common scale out of matrices (..., 3, 3)."""
+    return R / torch.linalg.det(R)[..., None, None].clamp(min=torch.finfo(R.dtype).eps) ** (1 / 3)
 
 
 def _without_translation(R: Tensor) -> Tensor:

@@ -125,8 +125,9 @@ def match_patches(
         if temperature is None:
             weight = torch.ones_like(length)
         else:
+            t = t.masked_fill(~t_valid.unsqueeze(-1), 0.0)
             probability = match_probabilities(q, t, t_valid, temperature)
-            weight = point_confidence(point_moments(probability, x, chosen)[1], x, t_valid)
+            weight = point_confidence(point_moments(probability, x, t_valid, chosen)[1], x, t_valid)
         blocks.append(
             Matches(
                 forth.masked_fill(~ok, 0),

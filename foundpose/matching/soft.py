@@ -98,7 +98,7 @@ class SoftPatchMatcher(nn.Module):
         template, points = (x.masked_fill(~t_valid.unsqueeze(-1), 0.0) for x in (template, points))
 
         probability = match_probabilities(query, template, t_valid, self.temperature.to(query.dtype))
-        expected, variance = point_moments(probability, points)
+        expected, variance = point_moments(probability, points, t_valid)
         weight = point_confidence(variance, points, t_valid)
         patch = probability.detach().argmax(dim=-1) if P > 0 else valid.long()
         nearest = template.gather(1, patch.unsqueeze(-1).expand_as(query))
@@ -151,20 +151,25 @@ def match_probabilities(
     return torch.softmax(logits, dim=-1) * exists
 
 
-def point_moments(probability: Tensor, points: Tensor, centre: Tensor | None = None) -> tuple[Tensor, Tensor]:
+def point_moments(
+    probability: Tensor, points: Tensor, valid: Tensor, centre: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
     """Expected points and mean squared distances from them.
 
     Args:
-        probability: (n, P, Q), rows that sum to one.
-        points: (n, Q, 3).
+        probability: (n, P, Q), rows that sum to one over the valid points.
+        points: (n, Q, 3); those outside the mask may be anything.
+        valid: (n, Q) bool.
         centre: (n, P, 3) points to measure the distances from, or None for the expected ones.
 
     Returns:
         Expected points (n, P, 3) and mean squared distances (n, P). Differentiable w.r.t. all arguments.
     """
     # Moments about the middle of the points: far from the origin, squares would leave float32 few digits.
-    middle = points.detach().mean(dim=1, keepdim=True)
-    local = points - middle
+    share = valid.unsqueeze(-1)
+    points = points.masked_fill(~share, 0.0)
+    middle = points.detach().sum(dim=1, keepdim=True) / share.sum(dim=1, keepdim=True).clamp(min=1)
+    local = (points - middle) * share
     mean = probability @ local
     second = (probability @ local.square().sum(-1, keepdim=True)).squeeze(-1)
     if centre is None:
@@ -180,13 +185,13 @@ def point_confidence(variance: Tensor, points: Tensor, valid: Tensor) -> Tensor:
 
     Args:
         variance: (n, P), squared mesh units.
-        points: (n, Q, 3) the template's points; those outside the mask must be finite.
+        points: (n, Q, 3) the template's points; those outside the mask may be anything.
         valid: (n, Q) bool.
 
     Returns:
         (n, P) in (0, 1]; 1 where the points have no extent. Differentiable w.r.t. all but the spacing.
     """
-    points = points.detach()
+    points = points.detach().masked_fill(~valid.unsqueeze(-1), 0.0)
     share = valid.to(points.dtype).unsqueeze(-1)
     count = share.sum(1, keepdim=True).clamp(min=1.0)
     centred = (points - (share * points).sum(1, keepdim=True) / count) * share

@@ -128,6 +128,7 @@ def optimise_pose(
     return result._replace(
         T=torch.where(failed[:, None, None], result.T, optimum.T),
         cost=torch.where(failed, result.cost, optimum.cost),
+        regular=optimum.regular,
     )
 
 

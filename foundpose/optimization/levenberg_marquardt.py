@@ -35,6 +35,8 @@ class LevenbergMarquardtResult(NamedTuple):
         failed: (B,) bool, the problem cannot be solved: a cost, H or g that is not finite at the initial pose, or
             an H of zeros (no data). Such a pose is returned as it came.
         H: (B, 6, 6) Gauss-Newton matrix at ``T``.
+        regular: (B,) bool, set with an implicit gradient: the second derivative could be inverted; elsewhere the
+            gradient of ``T`` is zero. All true without one.
     """
 
     T: Tensor
@@ -44,6 +46,7 @@ class LevenbergMarquardtResult(NamedTuple):
     converged: Tensor
     failed: Tensor
     H: Tensor
+    regular: Tensor
 
 
 def levenberg_marquardt(
@@ -122,7 +125,8 @@ def levenberg_marquardt(
         damping = torch.where(accepted, damping * 0.1, damping * 10.0).clamp(1e-10, 1e10)
         iterations = iterations + active.to(iterations.dtype)
         converged = converged | (active & finished)
-    return LevenbergMarquardtResult(T, cost, initial_cost, iterations, converged, failed, H)
+    regular = torch.ones_like(failed)
+    return LevenbergMarquardtResult(T, cost, initial_cost, iterations, converged, failed, H, regular)
 
 
 def _finite(cost: Tensor, H: Tensor, g: Tensor) -> Tensor:
@@ -142,8 +146,9 @@ def _solve(H: Tensor, g: Tensor, damping: Tensor) -> tuple[Tensor, Tensor]:
     # Solving in the scaled variables keeps the condition number free of the units.
     root = scaling.sqrt()
     scaled = H / (root[:, :, None] * root[:, None, :]) + torch.diag_embed(damping[:, None].expand_as(root))
-    factor, info = torch.linalg.cholesky_ex(scaled)
-    solved = usable & (info == 0)
-    factor = torch.where(solved[:, None, None], factor, torch.eye(6, dtype=H.dtype, device=H.device))
+    solved = usable & (torch.linalg.cholesky_ex(scaled.detach()).info == 0)
+    # Not after the factorisation, whose derivative would be NaN where it fails.
+    identity = torch.eye(6, dtype=H.dtype, device=H.device)
+    factor = torch.linalg.cholesky_ex(torch.where(solved[:, None, None], scaled, identity)).L
     step = -torch.cholesky_solve((g / root).unsqueeze(-1), factor).squeeze(-1) / root
     return torch.where(solved[:, None], step, torch.zeros_like(step)), solved

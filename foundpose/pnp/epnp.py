@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from foundpose.geometry.transforms import make_transform, transform_points
-from foundpose.pnp.derivatives import attach_optimum, eigenbasis, safe_sqrt
+from foundpose.optimization.derivatives import attach_optimum, eigenbasis, safe_sqrt
 from foundpose.pnp.polish import check_correspondences, rays_of_usable_pixels, usable_coordinates
 from foundpose.pnp.weak_perspective import align_points, weak_perspective_depths
 

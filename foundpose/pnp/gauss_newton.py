@@ -18,14 +18,16 @@ class PnpOptimum(NamedTuple):
     Attributes:
         T_camera_from_model: (B, 4, 4), mesh units.
         covariance: (B, 6, 6) of the left twist (v, ω) in the camera frame, in mesh units and radians: the true pose
-            is ``exp(δ) @ T`` with δ of this covariance. Infinite where the points do not determine the pose, or (when
-            the noise is estimated) leave nothing to estimate it from. A constant for autograd.
+            is ``exp(δ) @ T`` with δ of this covariance. Infinite where the pose failed, where the points do not
+            determine it, or (when the noise is estimated) leave nothing to estimate it from. A constant for autograd.
         cost: (B,) ``½ Σ w ρ`` at the minimum, px².
         initial_cost: (B,) cost at the initial pose, px²; infinite where a weighted point is behind the camera there.
         iterations: (B,) int64.
         converged: (B,) bool.
         failed: (B,) bool, the initial pose has a weighted point behind the camera, no point has weight, or some
             number is not finite; the pose comes back as it was.
+        regular: (B,) bool, the pose has an implicit gradient; elsewhere (failed, or not determined by the points to
+            the precision of the numbers) it is zero. Told in gradient mode only, all true without.
     """
 
     T_camera_from_model: Tensor
@@ -35,6 +37,7 @@ class PnpOptimum(NamedTuple):
     iterations: Tensor
     converged: Tensor
     failed: Tensor
+    regular: Tensor
 
 
 class GaussNewtonPnp(nn.Module):
@@ -112,6 +115,7 @@ class GaussNewtonPnp(nn.Module):
             result, frame = self.optimise(T_camera_from_model, points_image, points_model, K, weights)
             weights = unit_weights(points_image) if weights is None else weights.to(points_image.dtype)
             covariance = self._covariance(
+                result.failed,
                 result.T.detach(),
                 result.H.detach(),
                 LocalFrame(*(part.detach() for part in frame)),
@@ -128,6 +132,7 @@ class GaussNewtonPnp(nn.Module):
             result.iterations,
             result.converged,
             result.failed,
+            result.regular & ~result.failed if torch.is_grad_enabled() else result.regular,
         )
 
     def optimise(
@@ -158,12 +163,14 @@ class GaussNewtonPnp(nn.Module):
         points_model: Tensor,
         K: Tensor,
         weights: Tensor,
-    ) -> Tensor:
-        """Give poses that this module has found (B, 4, 4) the implicit gradient, without touching their values."""
+    ) -> tuple[Tensor, Tensor]:
+        """Give poses that this module has found (B, 4, 4) the implicit gradient, without touching their values, and
+        say which have one (B,)."""
         return attach_pnp_gradient(T_camera_from_model, points_image, points_model, K, weights, self.loss)
 
     def _covariance(
         self,
+        failed: Tensor,
         T: Tensor,
         H: Tensor,
         frame: LocalFrame,
@@ -190,4 +197,4 @@ class GaussNewtonPnp(nn.Module):
         to_camera = frame.twist_to_camera()
         covariance = variance[:, None, None] * (to_camera @ system.inverse() @ to_camera.transpose(-1, -2))
         unknown = torch.diag_embed(torch.full_like(H[:, 0], torch.inf))
-        return torch.where((known & system.usable)[:, None, None], covariance, unknown)
+        return torch.where((known & system.usable & ~failed)[:, None, None], covariance, unknown)

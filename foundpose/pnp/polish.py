@@ -150,10 +150,12 @@ def attach_pnp_gradient(
     K: Tensor,
     weights: Tensor,
     loss: RobustLoss | None = None,
-) -> Tensor:
+) -> tuple[Tensor, Tensor]:
     """Poses that minimise the reprojection error, with the gradient of that optimum; see :func:`polish_pnp`.
 
-    The values do not change by a single bit. Poses without a well-conditioned optimum have a gradient of zero.
+    Returns:
+        The poses, which do not change by a single bit, and which of them have a well-conditioned optimum (B,); the
+        others have a gradient of zero.
     """
     T = T_camera_from_model.detach()
     weights = weights.to(points_image.dtype)
@@ -164,7 +166,7 @@ def attach_pnp_gradient(
         frame.pose_to_local(T),
     )
     attached = frame.pose_from_local(optimum.T)
-    return T + (attached - attached.detach())
+    return T + (attached - attached.detach()), optimum.regular
 
 
 def _where(sane: Tensor, matrices: Tensor, size: int) -> Tensor:
@@ -279,6 +281,14 @@ def usable_coordinates(points: Tensor) -> Tensor:
     return (points.abs() < torch.finfo(points.dtype).max ** 0.25).all(-1)
 
 
+def invertible_intrinsics(K: Tensor) -> Tensor:
+    """Which intrinsics (B, 3, 3) have an inverse to the precision of the numbers: (B,) bool."""
+    K = K.detach()
+    # Hadamard's inequality bounds the determinant by the product of the rows' lengths.
+    bound = torch.linalg.vector_norm(K, dim=-1).prod(-1)
+    return torch.isfinite(bound) & (torch.linalg.det(K).abs() > 8.0 * torch.finfo(K.dtype).eps * bound)
+
+
 def rays_of_usable_pixels(points_image: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
     """Rays through pixels, where there may be pixels that are no numbers and intrinsics without inverse.
 
@@ -290,10 +300,7 @@ def rays_of_usable_pixels(points_image: Tensor, K: Tensor) -> tuple[Tensor, Tens
         Rays (B, N, 3) in the camera frame with z = 1, and which of them are of use (B, N). The others are fixed
         numbers. Differentiable w.r.t. both arguments; what is not of use has a gradient of zero.
     """
-    # Hadamard's inequality bounds the determinant by the product of the rows' lengths.
-    bound = torch.linalg.vector_norm(K.detach(), dim=-1).prod(-1)
-    determinant = torch.linalg.det(K.detach()).abs()
-    invertible = torch.isfinite(bound) & (determinant > 8.0 * torch.finfo(K.dtype).eps * bound)
+    invertible = invertible_intrinsics(K)
     K = torch.where(invertible[:, None, None], K, torch.eye(3, dtype=K.dtype, device=K.device))
     usable = usable_coordinates(points_image) & invertible.unsqueeze(-1)
     pixels = torch.where(usable.unsqueeze(-1), points_image, torch.zeros_like(points_image))

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from foundpose.geometry.cameras import pixel_rays
 from foundpose.geometry.transforms import make_transform
 from foundpose.pnp.gauss_newton import GaussNewtonPnp
-from foundpose.pnp.polish import check_correspondences, usable_coordinates
+from foundpose.pnp.polish import check_correspondences, invertible_intrinsics, usable_coordinates
 from foundpose.pnp.sampling import SAMPLE_SIZE, Hypotheses, SolverName, check_solver, sample_hypotheses
 from foundpose.pnp.scoring import reprojection_errors, select_inliers
 from foundpose.pnp.soft_selection import PoseCandidates, SoftInlierSelection
@@ -44,6 +44,8 @@ class PnpResult(NamedTuple):
         success: (B,) bool, ``status`` is OK.
         status: (B,) int64, values of :class:`PnpStatus`.
         reprojection_rmse: (B,) root mean square distance of the inliers in pixels; infinite without inliers.
+        regular: (B,) bool, the pose has an implicit gradient; elsewhere it is zero. Told in gradient mode only, all
+            true without.
         candidates: the hypotheses of a soft selection, or None without one.
     """
 
@@ -53,6 +55,7 @@ class PnpResult(NamedTuple):
     success: Tensor
     status: Tensor
     reprojection_rmse: Tensor
+    regular: Tensor
     candidates: PoseCandidates | None = None
 
 
@@ -144,7 +147,8 @@ class RansacPnp(nn.Module):
             valid: (B, N) bool, which correspondences exist; None means all. Those with coordinates that are
                 not finite, or too large to be squared, do not count either.
             weights: (B, N), how much each counts in the polish; None means all the same. Those whose weight is not
-                positive (or no number) do not exist. Sampling and inlier counts do not look at weights.
+                positive (or no number) do not exist. Sampling and inlier counts do not look at weights, a soft
+                selection does.
 
         Returns:
             A :class:`PnpResult`.
@@ -172,8 +176,7 @@ class RansacPnp(nn.Module):
         valid: Tensor | None,
         weights: Tensor | None,
     ) -> PnpResult:
-        determinant = torch.linalg.det(K.detach())
-        invertible = torch.isfinite(determinant) & (determinant.abs() > 0)
+        invertible = invertible_intrinsics(K)
         K = torch.where(invertible[:, None, None], K, torch.eye(3, dtype=K.dtype, device=K.device))
         rays = pixel_rays(points_image.detach(), K.detach())
         sane = usable_coordinates(points_image) & usable_coordinates(points_model) & usable_coordinates(rays)
@@ -195,15 +198,22 @@ class RansacPnp(nn.Module):
             hypotheses.T.flatten(0, 1),
             _pose_in_front(points_model.detach(), valid).repeat_interleave(kept, dim=0),
         )
-        T, inliers = self._polish(T, found, problem.repeat(kept))
+        T, inliers, regular = self._polish(T, found, problem.repeat(kept))
         found = found.unflatten(0, (-1, kept))
         candidates = None
         if self.soft_selection is not None:
             candidates = self.soft_selection(
-                T.unflatten(0, (-1, kept)), found, points_image, points_model, K, valid, self.threshold
+                T.unflatten(0, (-1, kept)),
+                found,
+                points_image,
+                points_model,
+                K,
+                valid,
+                self.threshold,
+                weights,
             )
         # The first hypothesis is the best.
-        T, inliers, found = T[::kept], inliers[::kept], found[:, 0]
+        T, inliers, regular, found = T[::kept], inliers[::kept], regular[::kept], found[:, 0]
 
         num_inliers = inliers.sum(-1)
         status = torch.full_like(num_inliers, int(PnpStatus.OK))
@@ -217,7 +227,7 @@ class RansacPnp(nn.Module):
         rmse = mean.clamp(min=torch.finfo(mean.dtype).tiny).sqrt()
         rmse = rmse.masked_fill(num_inliers == 0, torch.inf)
         success = status == int(PnpStatus.OK)
-        return PnpResult(T, inliers, num_inliers, success, status, rmse, candidates)
+        return PnpResult(T, inliers, num_inliers, success, status, rmse, regular, candidates)
 
     def _sample(
         self, points_image: Tensor, points_model: Tensor, K: Tensor, valid: Tensor, usable: Tensor
@@ -236,8 +246,9 @@ class RansacPnp(nn.Module):
             keep=1 if self.soft_selection is None else self.soft_selection.num_candidates,
         )
 
-    def _polish(self, T: Tensor, found: Tensor, problem: "_Problem") -> tuple[Tensor, Tensor]:
-        """Polish poses (P, 4, 4) on their inliers; return them and the inliers (P, N) that they end up with."""
+    def _polish(self, T: Tensor, found: Tensor, problem: "_Problem") -> tuple[Tensor, Tensor, Tensor]:
+        """Polish poses (P, 4, 4) on their inliers; return them, the inliers (P, N) that they end up with, and which
+        have a gradient (P,)."""
         unrolled = self.polish.differentiation == "unrolled" and torch.is_grad_enabled()
         with torch.set_grad_enabled(unrolled):
             rounds = self.polish_rounds
@@ -250,12 +261,12 @@ class RansacPnp(nn.Module):
                 other = self._climb(start, alike, problem, min(rounds, 1))
                 better = alike & (other.cost < state.cost)
                 state = self._climb(_where(better, other, state), better, problem, rounds - 1)
-        T = state.T
+        T, regular = state.T, torch.ones_like(found)
         if torch.is_grad_enabled() and not unrolled:
             # The optimum is that of the inliers polished on, which the last selection may have changed.
             used = problem.weigh(state.used & found.unsqueeze(-1))
-            T = self.polish.attach_gradient(T, *problem[:3], used)
-        return T, state.inliers & found.unsqueeze(-1)
+            T, regular = self.polish.attach_gradient(T, *problem[:3], used)
+        return T, state.inliers & found.unsqueeze(-1), regular
 
     def _select(self, T: Tensor, problem: "_Problem") -> tuple[Tensor, Tensor, Tensor]:
         """Inliers of poses, twice, and truncated costs."""

@@ -34,9 +34,9 @@ class PoseCandidates(NamedTuple):
 class SoftInlierSelection(nn.Module):
     """Probabilistic choice of a hypothesis by its soft inlier count.
 
-    A correspondence counts ``sigmoid(sharpness · (threshold − error))`` towards a pose, and a pose is chosen with a
-    probability proportional to ``exp(count / temperature)``. So the expected loss over the choice is differentiable
-    with respect to the correspondences, those included that are outliers of the best pose.
+    A correspondence counts ``weight · sigmoid(sharpness · (threshold − error))`` towards a pose, and a pose is chosen
+    with a probability proportional to ``exp(count / temperature)``. So the expected loss over the choice is
+    differentiable with respect to the correspondences, those included that are outliers of the best pose.
 
     Args:
         num_candidates: number of hypotheses kept, those with the most inliers of all samples drawn; the others would
@@ -70,6 +70,7 @@ class SoftInlierSelection(nn.Module):
         K: Tensor,
         valid: Tensor,
         threshold: float,
+        weights: Tensor | None = None,
     ) -> PoseCandidates:
         """Score hypotheses.
 
@@ -81,9 +82,10 @@ class SoftInlierSelection(nn.Module):
             K: (B, 3, 3).
             valid: (B, N) bool.
             threshold: error that counts half, pixels.
+            weights: (B, N), how much each correspondence counts; None means one.
 
         Returns:
-            The candidates. Differentiable w.r.t. the poses, the points and ``K``.
+            The candidates. Differentiable w.r.t. the poses, the points, ``K`` and ``weights``.
         """
         squared, depth = reprojection_errors(
             T_camera_from_model, points_image.unsqueeze(1), points_model.unsqueeze(1), K.unsqueeze(1)
@@ -95,6 +97,8 @@ class SoftInlierSelection(nn.Module):
         error = torch.where(near, squared, torch.ones_like(squared)).sqrt()
         error = torch.where(near, error, torch.where(squared > 0, limit, 0.0))
         share = torch.sigmoid(self.sharpness * (threshold - error))
+        if weights is not None:
+            share = share * weights.unsqueeze(1)
         score = torch.where(counted, share, torch.zeros_like(share)).sum(-1)
         return choose_softly(T_camera_from_model, score, found, self.temperature)
 

@@ -98,9 +98,23 @@ class Mesh:
     def diameter(self) -> float:
         """Largest distance between two vertices, mesh units."""
         hull = self.hull_vertices.double()
-        # The difference, not cdist's dot products: those lose digits where the mesh lies off the origin.
-        largest = [(chunk[:, None] - hull[None]).square().sum(-1).max() for chunk in hull.split(256)]
-        return float(torch.stack(largest).max().sqrt())
+        hull = hull - (hull.amin(0) + hull.amax(0)) / 2
+        radius, order = torch.linalg.vector_norm(hull, dim=1).sort(descending=True)
+        hull = hull[order]
+        # The farthest from the farthest is a good start, and only points with r_i + r_j above it can do better.
+        tip, best = hull[0], 0.0
+        for _ in range(3):
+            distance = (hull - tip).square().sum(1)
+            best, tip = max(best, float(distance.max().sqrt())), hull[distance.argmax()]
+        for first in range(0, len(hull), 256):
+            if 2 * radius[first] <= best:
+                break
+            chunk, others = hull[first : first + 256], hull[radius >= best - radius[first]]
+            # Differences, not cdist's dot products, which lose digits.
+            squared = sum((chunk[:, k, None] - others[None, :, k]).square() for k in range(3))
+            assert isinstance(squared, Tensor)
+            best = max(best, float(squared.max().sqrt()))
+        return best
 
 
 def load_mesh(path: str | PathLike[str]) -> Mesh:

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from foundpose.features import ResidualAdapter
-from foundpose.losses import point_matching_error
+from foundpose.losses import GeodesicRotationLoss, PointMatchingLoss, ProjectionLoss
 from foundpose.matching import SoftPatchMatcher
 from foundpose.pnp import GaussNewtonPnp, RansacPnp
 from foundpose.training.pairs import PairBatch
@@ -18,7 +18,7 @@ class PairPoses(NamedTuple):
 
     Attributes:
         T_crop_from_model: (B, 4, 4), mesh units.
-        valid: (B,) bool.
+        valid: (B,) bool, the pose is an optimum with a gradient.
     """
 
     T_crop_from_model: Tensor
@@ -30,7 +30,7 @@ class PairLoss(NamedTuple):
 
     Attributes:
         loss: scalar, mean over the valid pairs.
-        error: (B,) point-matching errors in diameters; 0 where not valid.
+        error: (B,) errors of the poses, in the loss's unit; 0 where not valid.
         valid: (B,) bool.
     """
 
@@ -42,21 +42,25 @@ class PairLoss(NamedTuple):
 class AdapterTraining(pl.LightningModule):
     """Trains an adapter end to end: adapted descriptors, soft matching, PnP with implicit gradients, pose error.
 
-    Nothing tells the adapter which patches belong together; it only hears how far the model's points land from
-    where they should. A pair's loss is ``log(1 + error / error_scale)``, so that a hopeless pair pulls no harder than
-    others.
+    Nothing tells the adapter which patches belong together; it only hears how far off the pose is, for instance how
+    far the model's points land from where they should. A pair's loss is ``log(1 + error / error_scale)``, so that a
+    hopeless pair pulls no harder than others. The pairs' symmetries count.
 
     Args:
         adapter: what is trained, on both sides of a pair.
         matcher: matches adapted descriptors; its temperature is trained along if it is learnable.
         pnp: estimates poses: :class:`GaussNewtonPnp` starts at the true pose, :class:`RansacPnp` finds its own start.
-            The less robust its loss, the more matches have a gradient. Pairs without a converged pose do not count.
+            The less robust its loss, the more matches have a gradient. Pairs whose pose is no regular optimum, and
+            so has no gradient, do not count.
+        loss: error of a pose, ``reduction="none"``: in diameters for :class:`PointMatchingLoss` (the default, with
+            ``norm="l2"``), in pixels of the crop for :class:`ProjectionLoss`, in radians for
+            :class:`GeodesicRotationLoss`. Any other module is called as the first of these is.
         learning_rate: of Adam.
         weight_decay: of the adapter's matrices (decoupled).
-        error_scale: error in diameters beyond which a pair's pull wanes.
+        error_scale: error beyond which a pair's pull wanes, in the loss's unit.
 
     Raises:
-        ValueError: a setting out of range.
+        ValueError: a setting out of range, or a loss that is reduced.
     """
 
     def __init__(
@@ -64,6 +68,7 @@ class AdapterTraining(pl.LightningModule):
         adapter: ResidualAdapter,
         matcher: SoftPatchMatcher,
         pnp: GaussNewtonPnp | RansacPnp,
+        loss: nn.Module | None = None,
         learning_rate: float = 1e-3,
         weight_decay: float = 0.0,
         error_scale: float = 0.05,
@@ -74,9 +79,15 @@ class AdapterTraining(pl.LightningModule):
                 "learning_rate and error_scale must be positive and weight_decay not negative, got "
                 f"{learning_rate}, {error_scale} and {weight_decay}"
             )
+        loss = PointMatchingLoss("l2") if loss is None else loss
+        if getattr(loss, "reduction", "none") != "none":
+            raise ValueError(
+                f'loss must have reduction="none" (one error for each pair), got {loss.reduction!r}'
+            )
         self.adapter = adapter
         self.matcher = matcher
         self.pnp = pnp
+        self.loss = loss
         self.learning_rate = learning_rate
         self.weight_decay = weight_decay
         self.error_scale = error_scale
@@ -98,20 +109,31 @@ class AdapterTraining(pl.LightningModule):
         points, weight, valid = (x.squeeze(1) for x in (matches.points_model, matches.weight, matches.valid))
         if isinstance(self.pnp, RansacPnp):
             found = self.pnp(batch.query_pixels, points, batch.K_crop, valid, weight)
-            return PairPoses(found.T_camera_from_model, found.success)
+            return PairPoses(found.T_camera_from_model, found.success & found.regular)
         optimum = self.pnp(batch.T_crop_from_model, batch.query_pixels, points, batch.K_crop, weight)
         # The implicit gradient is that of an optimum, so there has to be one.
-        return PairPoses(optimum.T_camera_from_model, optimum.converged & ~optimum.failed)
+        valid = optimum.converged & optimum.regular & ~optimum.failed
+        return PairPoses(optimum.T_camera_from_model, valid)
+
+    def pose_errors(self, poses: PairPoses, batch: PairBatch) -> Tensor:
+        """Errors (B,) of the poses of B pairs, in the loss's unit; 0 where not valid."""
+        T, T_true = poses.T_crop_from_model, batch.T_crop_from_model
+        symmetries, valid = batch.symmetries, poses.valid
+        if isinstance(self.loss, GeodesicRotationLoss):
+            return self.loss(T, T_true, symmetries=symmetries, valid=valid)
+        if isinstance(self.loss, ProjectionLoss):
+            return self.loss(T, T_true, batch.surface, batch.K_crop, symmetries=symmetries, valid=valid)
+        return self.loss(
+            T, T_true, batch.surface, symmetries=symmetries, diameter=batch.diameter, valid=valid
+        )
 
     def pair_loss(self, batch: PairBatch) -> PairLoss:
         """Loss of B pairs; differentiable as :meth:`forward` is."""
-        T, valid = self(batch)
-        error = point_matching_error(
-            T, batch.T_crop_from_model, batch.surface, diameter=batch.diameter, valid=valid, norm="l2"
-        )
+        poses = self(batch)
+        error = self.pose_errors(poses, batch)
         # Not valid: an error of zero, which adds nothing.
-        loss = torch.log1p(error / self.error_scale).sum() / valid.sum().clamp(min=1)
-        return PairLoss(loss, error, valid)
+        loss = torch.log1p(error / self.error_scale).sum() / poses.valid.sum().clamp(min=1)
+        return PairLoss(loss, error, poses.valid)
 
     def training_step(self, batch: PairBatch, batch_idx: int) -> Tensor:
         """Loss of a batch; logged with the median error and the temperature."""
@@ -125,18 +147,17 @@ class AdapterTraining(pl.LightningModule):
         self._log("val", self.pair_loss(batch))
 
     def _log(self, stage: str, result: PairLoss) -> None:
-        size = len(result.valid)
-        error = torch.where(result.valid, result.error.detach(), torch.inf)
-        self.log(
-            f"{stage}/loss",
-            result.loss.detach(),
-            prog_bar=True,
-            on_step=False,
-            on_epoch=True,
-            batch_size=size,
-        )
-        for name, value in (("median_error", error.median()), ("valid", result.valid.float().mean())):
-            self.log(f"{stage}/{name}", value, on_step=False, on_epoch=True, batch_size=size)
+        def log(name: str, value: Tensor, size: int) -> None:
+            bar = name == "loss"
+            self.log(f"{stage}/{name}", value, prog_bar=bar, on_step=False, on_epoch=True, batch_size=size)
+
+        log("valid", result.valid.float().mean(), len(result.valid))
+        count = int(result.valid.sum())
+        # The loss and the errors are those of the valid pairs; without any there is nothing to tell.
+        if count > 0:
+            log("loss", result.loss.detach(), count)
+            error = torch.where(result.valid, result.error.detach(), torch.nan)
+            log("median_error", error.nanmedian(), count)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """Adam; decay for matrices only."""

@@ -8,7 +8,7 @@ import pytorch_lightning as pl
 import torch
 from torch.utils.data import DataLoader, Sampler
 
-from foundpose.geometry import PerspectiveCrop
+from foundpose.geometry import PerspectiveCrop, Symmetries
 from foundpose.onboarding import Onboarder, Progress
 from foundpose.rendering import Mesh
 from foundpose.synthetic import combine_seeds
@@ -53,6 +53,8 @@ class PairDataModule(pl.LightningDataModule):
         seed: of scenes, templates and the order of the pairs.
         cache: folder to keep the described pairs in, or None.
         progress: is told how far rendering has come.
+        symmetries: of the meshes to train on, one entry each; None: they have none.
+        validation_symmetries: of the others.
 
     Raises:
         ValueError: no meshes or no batch.
@@ -69,6 +71,8 @@ class PairDataModule(pl.LightningDataModule):
         seed: int = 0,
         cache: str | Path | None = None,
         progress: Progress | None = None,
+        symmetries: Symmetries | None = None,
+        validation_symmetries: Symmetries | None = None,
     ) -> None:
         super().__init__()
         if not meshes:
@@ -84,22 +88,31 @@ class PairDataModule(pl.LightningDataModule):
         self.seed = seed
         self.cache = None if cache is None else Path(cache)
         self.progress = progress
+        self.symmetries = symmetries
+        self.validation_symmetries = validation_symmetries
         self.training: PatchPairs | None = None
         self.validation: PatchPairs | None = None
 
     def setup(self, stage: str | None = None) -> None:
         """Make the pairs."""
         if self.training is None:
-            self.training = self._make(self.meshes, self.seed)
+            self.training = self._make(self.meshes, self.seed, self.symmetries)
         if self.validation is None and self.validation_meshes:
-            self.validation = self._make(self.validation_meshes, self.seed + 1)
+            self.validation = self._make(self.validation_meshes, self.seed + 1, self.validation_symmetries)
 
-    def _make(self, meshes: Sequence[Mesh], seed: int) -> PatchPairs:
-        return make_pairs(meshes, self.onboarder, self.crop, self.pairs, seed, self.cache, self.progress)
+    def _make(self, meshes: Sequence[Mesh], seed: int, symmetries: Symmetries | None) -> PatchPairs:
+        return make_pairs(
+            meshes, self.onboarder, self.crop, self.pairs, seed, self.cache, self.progress, symmetries
+        )
 
     def train_dataloader(self) -> DataLoader[PairBatch]:
-        """All training pairs in a new order each epoch."""
-        assert self.training is not None, "call setup first"
+        """All training pairs in a new order each epoch.
+
+        Raises:
+            RuntimeError: :meth:`setup` has not been called; Lightning's trainer does.
+        """
+        if self.training is None:
+            raise RuntimeError("there are no pairs yet: call setup() before train_dataloader()")
         sampler = EpochShuffle(len(self.training), self.seed)
         return DataLoader(self.training, self.batch_size, sampler=sampler, collate_fn=_as_it_is)
 

@@ -1,13 +1,17 @@
 """How right the poses of rendered scenes are, before and after training."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from foundpose.geometry import rotation_angle
-from foundpose.losses import point_matching_error
+from foundpose.geometry import Symmetries, rotation_angle
+from foundpose.losses import geodesic_rotation_error, point_matching_error
+from foundpose.losses.alignment import best_symmetry
+from foundpose.losses.points import nearest_angles_of_points
+from foundpose.losses.reduction import mean_norm, place_points
 from foundpose.onboarding import ObjectRepresentation, Progress
 from foundpose.pipeline import FoundPose
 from foundpose.rendering import Mesh, Renderer
@@ -20,11 +24,12 @@ RIGHT_DIAMETERS = 0.1
 
 
 class PoseErrors(NamedTuple):
-    """Errors of N poses.
+    """Errors of N poses, against whichever of the equivalent true poses of a symmetric object is nearest.
 
     Attributes:
         rotation: (N,) degrees; 180 where no pose was found.
-        translation: (N,) diameters; infinite where no pose was found.
+        translation: (N,) diameters; infinite where no pose was found. The nearest true pose is here the one of the
+            least mean squared distance of the model's points.
         matching: (N,) mean distance of the model's points in diameters, at most 1; 1 where no pose was found.
         right: (N,) bool, within 10 degrees and a tenth of the diameter.
     """
@@ -70,11 +75,12 @@ def evaluate_scenes(
     occlusion: bool = True,
     batch_size: int = 8,
     progress: Progress | None = None,
+    symmetries: Symmetries | None = None,
 ) -> dict[str, PoseErrors]:
     """Estimate an object's pose in cluttered scenes.
 
     Args:
-        pipeline: the method.
+        pipeline: the method; measured in eval mode, and left as it was.
         representation: the object, onboarded.
         mesh: the object.
         seeds: one scene each.
@@ -83,48 +89,92 @@ def evaluate_scenes(
         occlusion: hide a corner of the object.
         batch_size: scenes at a time.
         progress: is told of every batch.
+        symmetries: of the object, one entry; None: it has none, so that a pose which only looks right is wrong.
 
     Returns:
         Errors with the "retrieved" templates, and with the "nearest" one given, which leaves out retrieval.
     """
-    given = GivenTemplates(pipeline.retriever)
-    told = FoundPose(pipeline.crop, pipeline.extractor, given, pipeline.matcher, pipeline.pnp)  # type: ignore[arg-type]
-    told.eval()
-    device = representation.points_model.device
-    parts: dict[str, list[PoseErrors]] = {"retrieved": [], "nearest": []}
-    for start in range(0, len(seeds), batch_size):
-        chunk = seeds[start : start + batch_size]
-        scenes = [
-            cluttered_scene(mesh, s, occlusion=occlusion, renderer=renderer, light=light) for s in chunk
-        ]
-        image, K, mask, T_true = (torch.stack(field).to(device) for field in zip(*scenes, strict=True))
-        estimates = pipeline(image, K, representation, masks=mask)
-        parts["retrieved"].append(pose_errors(estimates.T_camera_from_model, estimates.valid, T_true, mesh))
-        T_crop = estimates.crops.T_crop_from_camera @ T_true
-        R_template = representation.T_template_from_model[:, :3, :3]
-        given.index = rotation_angle(T_crop[:, None, :3, :3], R_template[None]).argmin(dim=1, keepdim=True)
-        estimates = told(image, K, representation, masks=mask)
-        parts["nearest"].append(pose_errors(estimates.T_camera_from_model, estimates.valid, T_true, mesh))
-        if progress is not None:
-            progress("scenes", start + len(chunk), len(seeds))
+    with _eval_mode(pipeline):
+        given = GivenTemplates(pipeline.retriever)
+        told = FoundPose(
+            pipeline.crop,
+            pipeline.extractor,
+            given,  # type: ignore[arg-type]
+            pipeline.matcher,
+            pipeline.pnp,
+            pipeline.refiner,
+            pipeline.refine,
+        ).eval()
+        device = representation.points_model.device
+        parts: dict[str, list[PoseErrors]] = {"retrieved": [], "nearest": []}
+        for start in range(0, len(seeds), batch_size):
+            chunk = seeds[start : start + batch_size]
+            scenes = [
+                cluttered_scene(mesh, s, occlusion=occlusion, renderer=renderer, light=light) for s in chunk
+            ]
+            image, K, mask, T_true = (torch.stack(field).to(device) for field in zip(*scenes, strict=True))
+            found = pipeline(image, K, representation, masks=mask, meshes=mesh)
+            T_crop = found.crops.T_crop_from_camera @ T_true
+            R_template = representation.T_template_from_model[:, :3, :3]
+            given.index = rotation_angle(T_crop[:, None, :3, :3], R_template[None]).argmin(
+                dim=1, keepdim=True
+            )
+            helped = told(image, K, representation, masks=mask, meshes=mesh)
+            for name, estimates in (("retrieved", found), ("nearest", helped)):
+                parts[name].append(
+                    pose_errors(estimates.T_camera_from_model, estimates.valid, T_true, mesh, symmetries)
+                )
+            if progress is not None:
+                progress("scenes", start + len(chunk), len(seeds))
     return {
         name: PoseErrors(*(torch.cat(field) for field in zip(*errors, strict=True)))
         for name, errors in parts.items()
     }
 
 
-def pose_errors(T_est: Tensor, valid: Tensor, T_true: Tensor, mesh: Mesh) -> PoseErrors:
-    """Errors of poses (N, 4, 4) against true ones, on the CPU; no pose has the largest errors."""
+@contextmanager
+def _eval_mode(module: nn.Module) -> Iterator[None]:
+    """Put a module in eval mode, and afterwards every part of it back into its own."""
+    modes = [(part, part.training) for part in module.modules()]
+    module.eval()
+    try:
+        yield
+    finally:
+        for part, training in modes:
+            part.training = training
+
+
+def pose_errors(
+    T_est: Tensor, valid: Tensor, T_true: Tensor, mesh: Mesh, symmetries: Symmetries | None = None
+) -> PoseErrors:
+    """Errors of poses (N, 4, 4) against true ones, on the CPU; no pose has the largest errors.
+
+    ``symmetries`` are those of the object, one entry; None: it has none.
+    """
     T_est, valid, T_true = T_est.cpu(), valid.cpu(), T_true.cpu()
     diameter = float(mesh.diameter)
-    rotation = torch.rad2deg(rotation_angle(T_est[:, :3, :3], T_true[:, :3, :3]))
-    rotation = torch.where(valid, rotation, 180.0)
-    distance = torch.linalg.vector_norm(T_est[:, :3, 3] - T_true[:, :3, 3], dim=-1) / diameter
-    distance = torch.where(valid, distance, torch.inf)
     points = mesh.vertices[:: max(1, len(mesh.vertices) // 1000)].to(T_est)
-    matching = point_matching_error(T_est, T_true, points, norm="l2") / diameter
+    T_nearest = T_true
+    if symmetries is not None:
+        symmetries = symmetries.to("cpu", T_est.dtype).gather(torch.zeros(len(T_est), dtype=torch.int64))
+        T_nearest = _nearest_truth(T_est, T_true, symmetries, points[None])
+    rotation = torch.rad2deg(geodesic_rotation_error(T_est, T_true, symmetries))
+    rotation = torch.where(valid, rotation, 180.0)
+    distance = torch.linalg.vector_norm(T_est[:, :3, 3] - T_nearest[:, :3, 3], dim=-1) / diameter
+    distance = torch.where(valid, distance, torch.inf)
+    matching = point_matching_error(T_est, T_true, points, symmetries, norm="l2") / diameter
     matching = torch.where(valid, matching, torch.inf).clamp(max=1.0)
     return PoseErrors(rotation, distance, matching, (rotation < RIGHT_DEGREES) & (distance < RIGHT_DIAMETERS))
+
+
+def _nearest_truth(T_est: Tensor, T_true: Tensor, symmetries: Symmetries, points: Tensor) -> Tensor:
+    """The equivalent true poses that bring points (1, M, 3) nearest to the estimates, by mean squared distance."""
+    angles = nearest_angles_of_points(T_est, T_true, symmetries, points)
+
+    def error(S: Tensor) -> Tensor:
+        return mean_norm(place_points(T_est[:, None] - T_true[:, None] @ S, points), "squared")
+
+    return T_true @ best_symmetry(error, symmetries, angles, refine=False)
 
 
 def summarize(errors: PoseErrors) -> dict[str, float]:

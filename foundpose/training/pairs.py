@@ -12,7 +12,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from foundpose.features import PatchFeatures
-from foundpose.geometry import PerspectiveCrop
+from foundpose.geometry import PerspectiveCrop, Symmetries
 from foundpose.io import write_atomically
 from foundpose.onboarding import Onboarder, Progress
 from foundpose.pipeline import select_query_patches
@@ -35,6 +35,7 @@ class PairBatch(NamedTuple):
         T_crop_from_model: (B, 4, 4) true poses, mesh units.
         surface: (B, M, 3) points of the object's surface, mesh units.
         diameter: (B,) mesh units.
+        symmetries: of the B objects; None: they have none.
     """
 
     query_descriptors: Tensor
@@ -47,6 +48,7 @@ class PairBatch(NamedTuple):
     T_crop_from_model: Tensor
     surface: Tensor
     diameter: Tensor
+    symmetries: Symmetries | None = None
 
 
 @dataclass(frozen=True)
@@ -96,10 +98,12 @@ class PatchPairs(torch.utils.data.Dataset[PairBatch]):
             ``template_offsets`` cut them apart; ``query_of`` (N,) is the crop and ``mesh_of`` (N,) the mesh of each
             pair, ``K_crop`` and ``T_crop_from_model`` are those of the crops, ``surface`` and ``diameter`` of the
             meshes. Pair n owns template n.
+        symmetries: of the meshes, one entry each; None: they have none.
     """
 
-    def __init__(self, tensors: dict[str, Tensor]) -> None:
+    def __init__(self, tensors: dict[str, Tensor], symmetries: Symmetries | None = None) -> None:
         self.tensors = tensors
+        self.symmetries = symmetries
 
     def __len__(self) -> int:
         return len(self.tensors["query_of"])
@@ -126,6 +130,7 @@ class PatchPairs(torch.utils.data.Dataset[PairBatch]):
             t["T_crop_from_model"][query],
             t["surface"][mesh],
             t["diameter"][mesh],
+            None if self.symmetries is None else self.symmetries.gather(mesh),
         )
 
 
@@ -137,6 +142,7 @@ def make_pairs(
     seed: int,
     cache: Path | None = None,
     progress: Progress | None = None,
+    symmetries: Symmetries | None = None,
 ) -> PatchPairs:
     """Render and describe pairs, or read them from the cache.
 
@@ -148,9 +154,11 @@ def make_pairs(
         seed: of everything that is random.
         cache: folder to keep the pairs in; other settings, meshes or weights get another file.
         progress: is told of every crop.
+        symmetries: of the meshes, one entry each (:func:`foundpose.geometry.stack_symmetries`); None: they have none.
+            They change no picture, so the cache does not depend on them.
 
     Raises:
-        ValueError: no meshes, or crop and templates of different sizes.
+        ValueError: no meshes, crop and templates of different sizes, or symmetries of another number of objects.
     """
     if not meshes:
         raise ValueError("meshes is empty: give at least one to make pairs of")
@@ -158,6 +166,9 @@ def make_pairs(
         raise ValueError(
             f"crops are {crop.size} px wide, templates {onboarder.image_size} px; use one size for both"
         )
+    if symmetries is not None:
+        symmetries = symmetries.to("cpu", torch.float32)
+        symmetries.check(len(meshes), meshes[0].vertices)
     path = None
     if cache is not None:
         facts = {
@@ -173,11 +184,11 @@ def make_pairs(
         text = json.dumps(facts, sort_keys=True, default=list)
         path = cache / f"pairs-{hashlib.sha256(text.encode()).hexdigest()[:12]}.safetensors"
         if path.is_file():
-            return PatchPairs(load_file(path))
+            return PatchPairs(load_file(path), symmetries)
     tensors = _describe(meshes, onboarder, crop, settings, seed, progress)
     if path is not None:
         write_atomically(path, lambda temporary: save_file(tensors, str(temporary)))
-    return PatchPairs(tensors)
+    return PatchPairs(tensors, symmetries)
 
 
 @torch.no_grad()  # the descriptors are data; what is trained comes after them

@@ -122,14 +122,16 @@ def test_padding_and_batch_do_not_matter(seed: int, mode: str, top_k: int | None
     query, query_valid, template, template_valid, pixels, points = problem(seed=seed)
     matcher = PatchMatcher(mode, top_k, confidence_temperature=0.8)
     expected = matcher(query, query_valid, template, template_valid, pixels, points)
-    far = 1e3
+    far = 1e9
     padded = matcher(
         torch.nn.functional.pad(query.masked_fill(~query_valid[..., None], far), (0, 0, 0, 9), value=far),
         torch.nn.functional.pad(query_valid, (0, 9)),
-        torch.nn.functional.pad(template.masked_fill(~template_valid[..., None], 0.0), (0, 0, 0, 6)),
+        torch.nn.functional.pad(
+            template.masked_fill(~template_valid[..., None], far), (0, 0, 0, 6), value=far
+        ),
         torch.nn.functional.pad(template_valid, (0, 6)),
         torch.nn.functional.pad(pixels, (0, 0, 0, 9)),
-        torch.nn.functional.pad(points, (0, 0, 0, 6)),
+        torch.nn.functional.pad(points.masked_fill(~template_valid[..., None], far), (0, 0, 0, 6), value=far),
     )
     assert not padded.valid[..., 30:].any()
     assert_same(Matches(*(t[:, :, :30] for t in padded)), expected)

@@ -3,7 +3,8 @@ import math
 import pytest
 import torch
 
-from foundpose.geometry import PerspectiveCrop, make_transform
+from foundpose.geometry import PerspectiveCrop, make_transform, symmetries_from_models_info
+from foundpose.geometry.symmetries import axis_rotation
 from foundpose.matching import PatchMatcher
 from foundpose.pipeline import FoundPose
 from foundpose.pnp import RansacPnp
@@ -39,6 +40,37 @@ def test_pose_errors_of_known_poses(bodies):
     assert torch.allclose(errors.matching[[0, 1, 3, 4]], wanted, atol=1e-4)
 
 
+def test_pose_errors_of_symmetric_objects(bodies):
+    mesh = bodies[0]
+    axis, origin = torch.tensor([0.0, 0.6, 0.8]), torch.tensor([5.0, -40.0, 20.0])
+    symmetries = symmetries_from_models_info(
+        {"symmetries_continuous": [{"axis": axis.tolist(), "offset": origin.tolist()}]}
+    )
+    truth = make_transform(turn(25.0), torch.tensor([3.0, 4.0, 500.0])).expand(3, 4, 4)
+    angles = torch.tensor([0.0, 1.0, 2.5])
+    tilt = make_transform(
+        torch.tensor([[1.0, 0, 0], [0, 0.9848, -0.1736], [0, 0.1736, 0.9848]]), torch.tensor([0.0, 0.0, 0.0])
+    )
+    spun = truth @ axis_rotation(axis.expand(3, 3), origin.expand(3, 3), angles)
+    found = torch.ones(3, dtype=torch.bool)
+    errors = pose_errors(spun, found, truth, mesh, symmetries)
+    assert errors.right.all()
+    assert errors.rotation.max() < 0.1
+    assert errors.translation.max() < 1e-3
+    assert errors.matching.max() < 1e-3
+    without = pose_errors(spun, found, truth, mesh)
+    assert torch.allclose(without.rotation, torch.rad2deg(angles), atol=0.1)
+    assert without.right.tolist() == [True, False, False]
+    assert (without.translation[1:] > 0.05).all()
+    # A tilt in the object's frame off the axis, after a spin: as far off as the tilt alone.
+    errors = pose_errors(spun @ tilt, found, truth, mesh, symmetries)
+    alone = pose_errors(truth @ tilt, found, truth, mesh, symmetries)
+    for name in ("rotation", "translation", "matching"):
+        one, all_ = getattr(alone, name), getattr(errors, name)
+        assert torch.allclose(one, all_, atol=2e-3 if name != "rotation" else 0.1), name
+    assert 5.0 < alone.rotation[0] < 10.0
+
+
 def errors_of(rotation, matching):
     rotation = torch.tensor(rotation)
     return PoseErrors(rotation, torch.zeros(len(rotation)), torch.tensor(matching), rotation < 10)
@@ -72,7 +104,9 @@ def test_scenes_with_retrieved_and_with_nearest_templates(bodies, sift_onboarder
         TemplateRetriever(sift_onboarder.bow, 2),
         PatchMatcher(),
         RansacPnp(iterations=100),
-    ).eval()
+    ).train()
+    pipeline.extractor.eval()
+    modes = [part.training for part in pipeline.modules()]
     seeds = [4, 7, 9]
     steps = []
     errors = evaluate_scenes(
@@ -85,10 +119,26 @@ def test_scenes_with_retrieved_and_with_nearest_templates(bodies, sift_onboarder
         progress=lambda stage, done, total: steps.append((done, total)),
     )
     assert steps == [(2, 3), (3, 3)]
+    # Measured in eval mode, the caller's modules are left in their own modes.
+    assert [part.training for part in pipeline.modules()] == modes
+    assert len(set(modes)) == 2
     alone = evaluate_scenes(pipeline, representation, mesh, [9], sift_onboarder.renderer)
     for mode in ("retrieved", "nearest"):
         assert errors[mode].rotation.shape == (3,)
         assert torch.allclose(errors[mode].rotation[2:], alone[mode].rotation, atol=0.5)
+    # Had the object the symmetry of a half turn, no error would be larger and some would be smaller.
+    half_turn = {"symmetries_discrete": [[-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]]}
+    forgiving = evaluate_scenes(
+        pipeline,
+        representation,
+        mesh,
+        seeds,
+        sift_onboarder.renderer,
+        symmetries=symmetries_from_models_info(half_turn),
+    )
+    for mode in ("retrieved", "nearest"):
+        assert (forgiving[mode].rotation <= errors[mode].rotation + 0.5).all()
+        assert (forgiving[mode].matching <= errors[mode].matching + 0.01).all()
 
 
 def test_given_templates(sift_onboarder):

@@ -7,10 +7,19 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from lightning_fabric.utilities import move_data_to_device
 from scipy.spatial import cKDTree
 
 from foundpose.features import AdaptedExtractor
-from foundpose.geometry import SuperFibonacci, project_points, rotation_angle, transform_points
+from foundpose.geometry import (
+    SuperFibonacci,
+    no_symmetries,
+    project_points,
+    rotation_angle,
+    stack_symmetries,
+    symmetries_from_models_info,
+    transform_points,
+)
 from foundpose.synthetic import LightVariation, cluttered_scene, procedural_mesh
 from foundpose.training import EpochShuffle, PairSettings, make_pairs, nearby_rotations, render_crops
 
@@ -148,6 +157,29 @@ def test_cache(bodies, sift_onboarder, crop, settings, tmp_path):
     make(other)
     assert steps == [2]
     assert len(list(tmp_path.iterdir())) == 3
+
+
+def test_symmetries_go_with_their_objects(bodies, sift_onboarder, crop, settings, tmp_path):
+    few = dataclasses.replace(settings, crops_per_mesh=1, templates_per_crop=1)
+    spin = symmetries_from_models_info({"symmetries_continuous": [{"axis": [0, 0, 2], "offset": [1, 2, 3]}]})
+    both = stack_symmetries([spin, symmetries_from_models_info({})])
+
+    def make(symmetries):
+        return make_pairs(bodies, sift_onboarder, crop, few, 0, tmp_path, symmetries=symmetries)
+
+    assert make(None)[0].symmetries is None
+    found = make(both)
+    # They change no picture.
+    assert len(list(tmp_path.iterdir())) == 1
+    batch = found.__getitems__([1, 0, 1])
+    assert batch.symmetries.axis_valid.tolist() == [[False], [True], [False]]
+    assert batch.symmetries.origins[1].tolist() == [[1.0, 2.0, 3.0]]
+    batch.symmetries.check(3, batch.surface)
+    # Lightning moves them along.
+    moved = move_data_to_device(batch, torch.device("meta"))
+    assert moved.symmetries.axes.device == moved.surface.device == torch.device("meta")
+    with pytest.raises(ValueError, match="with B = 2"):
+        make(no_symmetries(3))
 
 
 def test_batches_are_padded(pairs):
