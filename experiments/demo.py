@@ -43,6 +43,7 @@ def run(cfg: DictConfig, output: Path) -> bool:
             scene.K[None].to(cfg.device),
             representation.to(cfg.device),
             masks=scene.mask[None].to(cfg.device),
+            meshes=mesh,
         )
     save_estimate_figure(
         output / "overlay.png",

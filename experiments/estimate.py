@@ -74,7 +74,8 @@ def estimate_picture(cfg: DictConfig, output: Path) -> None:
     name = Path(cfg.mesh).stem
     representation = method.store.get(mesh, name, ProgressBars(name)).to(cfg.device)
     index = torch.zeros(1, dtype=torch.int64)
-    estimates, seconds = run_pipeline(method, cfg.device, image, K, mask[None], [representation], index)
+    shown = [(mesh, representation)]
+    estimates, seconds = run_pipeline(method, cfg.device, image, K, mask[None], shown, index)
     facts = describe(estimates, 0) | {"mesh": str(cfg.mesh), "image": str(cfg.image), "time": seconds}
     write_json(output / "estimate.json", facts)
     write_results(output / "results.csv", to_results([facts | {"scene_id": 0, "im_id": 0, "obj_id": 0}]))
@@ -144,7 +145,7 @@ def estimate_dataset(cfg: DictConfig, output: Path) -> None:
             masks = torch.stack([instance.mask(dataset) for instance in members])
             ids = sorted({instance.obj_id for instance in members})
             index = torch.tensor([ids.index(instance.obj_id) for instance in members])
-            shown = [objects[i][1] for i in ids]
+            shown = [objects[i] for i in ids]
             estimates, seconds = run_pipeline(method, cfg.device, image, K, masks, shown, index)
             seconds += max(instance.time for instance in members)
             if cfg.overlays and position % cfg.overlays == 0:
@@ -162,7 +163,8 @@ def estimate_dataset(cfg: DictConfig, output: Path) -> None:
 
     write_json(output / "estimates.json", entries)
     csv = output / f"{cfg.method.replace('_', '-')}_{dataset.root.name}-{Path(cfg.data.split).name}.csv"
-    write_results(csv, to_results(entries))
+    counts = {target[:3]: target.inst_count for target in dataset.targets()}
+    write_results(csv, to_results(best_of_targets(entries, counts)))
     valid = sum(entry["valid"] for entry in entries)
     print(f"{len(entries)} instances in {len(images)} images, {valid} with a pose; written to {csv}")
 
@@ -173,7 +175,7 @@ def run_pipeline(
     image: Tensor,
     K: Tensor,
     masks: Tensor,
-    objects: list[ObjectRepresentation],
+    objects: list[tuple[Mesh, ObjectRepresentation]],
     object_index: Tensor,
 ) -> tuple[PoseEstimates, float]:
     """Poses of several masks of one image, and the seconds that they took."""
@@ -181,10 +183,11 @@ def run_pipeline(
         estimates = method.pipeline(
             image[None].to(device),
             K[None].to(device),
-            objects,
+            [representation for _, representation in objects],
             masks=masks.to(device),
             image_index=torch.zeros(len(masks), dtype=torch.int64, device=device),
             object_index=object_index.to(device),
+            meshes=[mesh for mesh, _ in objects],
         )
     return estimates, timer.seconds["pipeline"]
 
@@ -204,6 +207,22 @@ def describe(estimates: PoseEstimates, index: int) -> dict[str, Any]:
         "similarities": estimates.templates.similarity[index].nan_to_num(neginf=-1.0).tolist(),
         "best": int(estimates.best[index]),
     }
+
+
+def best_of_targets(
+    entries: list[dict[str, Any]], counts: dict[tuple[int, int, int], int]
+) -> list[dict[str, Any]]:
+    """As many entries of each target as it has instances, those with the best scores, in the order they came."""
+    ranks: dict[tuple[int, int, int], list[int]] = defaultdict(list)
+    for i, entry in enumerate(entries):
+        if entry["valid"]:
+            ranks[entry["scene_id"], entry["im_id"], entry["obj_id"]].append(i)
+    kept = {
+        i
+        for target, found in ranks.items()
+        for i in sorted(found, key=lambda i: -entries[i]["score"])[: counts.get(target, len(found))]
+    }
+    return [entry for i, entry in enumerate(entries) if i in kept]
 
 
 def to_results(entries: list[dict[str, Any]]) -> list[PoseResult]:

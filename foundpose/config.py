@@ -51,7 +51,8 @@ def build_method(cfg: DictConfig) -> Method:
     extractor: PatchExtractor = instantiate(cfg.extractor).to(device).eval()
     query_extractor = extractor if cfg.get("corruption") is None else instantiate(cfg.corruption)(extractor)
     onboarder: Onboarder = instantiate(cfg.onboarder, extractor=extractor)
-    pipeline: FoundPose = instantiate(cfg.pipeline, extractor=query_extractor)
+    refiner = None if cfg.get("refiner") is None else instantiate(cfg.refiner)
+    pipeline: FoundPose = instantiate(cfg.pipeline, extractor=query_extractor, refiner=refiner)
     return Method(
         onboarder.to(device).eval(),
         pipeline.to(device).eval(),

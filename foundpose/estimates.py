@@ -7,6 +7,7 @@ from torch import Tensor
 
 from foundpose.geometry import Crops
 from foundpose.pnp import PnpStatus, PoseCandidates
+from foundpose.refinement.base import RefinedPoses
 from foundpose.retrieval import QueryPatches, RetrievedTemplates
 
 
@@ -63,12 +64,15 @@ class PoseEstimates(NamedTuple):
 
     Attributes:
         T_camera_from_model: (B, 4, 4), mesh units; finite but meaningless where not valid.
-        score: (B,) share of the crop's patches that are inliers, in [0, 1].
-        num_inliers: (B,) inlier correspondences, the quality by which the best of h hypotheses is chosen.
+        score: (B,) confidence: the share of the crop's patches that are inliers, in [0, 1], or with a refiner the
+            refiner's score (0 for a pose that could not be refined and is returned as it was).
+        num_inliers: (B,) inlier correspondences of the chosen hypothesis, the quality by which the best of h is
+            chosen (with a refiner of several: chosen by its score).
         valid: (B,) bool, a pose with at least the fewest inliers that the PnP stage asks for. It is no confidence:
             noise can reach that many by chance. Judge by ``score``.
         status: (B,) codes of :class:`PoseStatus`.
         best: (B,) which hypothesis was chosen.
+        T_coarse: (B, 4, 4) its pose in the camera's frame before refinement; without a refiner the final one.
         crops: the perspective crops.
         query: the crops' patches.
         templates: the retrieved templates.
@@ -76,6 +80,7 @@ class PoseEstimates(NamedTuple):
         hypotheses: the poses of all retrieved templates.
         candidates: with a soft selection in the PnP stage, the hypotheses of all templates and samples with the
             probability of choosing each (``T_camera_from_model`` (B, h · J, 4, 4)); None without.
+        refined: what the refiner made of the hypotheses that it was given, in the crop's frame; None without.
     """
 
     T_camera_from_model: Tensor
@@ -84,9 +89,11 @@ class PoseEstimates(NamedTuple):
     valid: Tensor
     status: Tensor
     best: Tensor
+    T_coarse: Tensor
     crops: Crops
     query: QueryPatches
     templates: RetrievedTemplates
     correspondences: Correspondences
     hypotheses: PoseHypotheses
     candidates: PoseCandidates | None = None
+    refined: RefinedPoses | None = None

@@ -1,8 +1,8 @@
-"""The composed method: from images and masks to coarse poses."""
+"""The composed method: from images and masks to poses."""
 
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar, cast, get_args
 
 import torch
 import torch.nn.functional as F
@@ -15,7 +15,10 @@ from foundpose.matching import PatchMatcher, SoftPatchMatcher
 from foundpose.onboarding import ObjectRepresentation, RepresentationInfo
 from foundpose.pnp import PoseCandidates, RansacPnp
 from foundpose.pnp.soft_selection import choose_softly
+from foundpose.refinement import PoseProposals, PoseRefiner
+from foundpose.rendering import Mesh
 from foundpose.retrieval import QueryPatches, RetrievedTemplates, TemplateRetriever
+from foundpose.selection import RefineWhat, choose_coarse, choose_refined, hypotheses_to_refine
 
 _Fields = TypeVar("_Fields", bound=tuple[Any, ...])
 
@@ -47,7 +50,7 @@ class _ExtractorChecks:
 
 
 class FoundPose(nn.Module):
-    """Coarse 6D pose of onboarded objects (paper, Section 3).
+    """6D pose of onboarded objects (paper, Section 3).
 
     Args:
         crop: cuts perspective crops.
@@ -55,6 +58,9 @@ class FoundPose(nn.Module):
         retriever: finds similar templates.
         matcher: matches patches of crop and template.
         pnp: estimates a pose from each template's correspondences.
+        refiner: improves poses; None returns coarse ones.
+        refine: "best": refine the hypothesis with the most inliers. "all": refine those of all retrieved templates
+            and keep the one with the best refined score.
     """
 
     def __init__(
@@ -64,13 +70,19 @@ class FoundPose(nn.Module):
         retriever: TemplateRetriever,
         matcher: PatchMatcher | SoftPatchMatcher,
         pnp: RansacPnp,
+        refiner: PoseRefiner | None = None,
+        refine: RefineWhat = "best",
     ) -> None:
         super().__init__()
+        if refine not in get_args(RefineWhat):
+            raise ValueError(f"refine must be one of {get_args(RefineWhat)}, got {refine!r}")
         self.crop = crop
         self.extractor = extractor
         self.retriever = retriever
         self.matcher = matcher
         self.pnp = pnp
+        self.refiner = refiner
+        self.refine: RefineWhat = refine
         self._checks = _ExtractorChecks()
 
     def forward(
@@ -82,6 +94,7 @@ class FoundPose(nn.Module):
         boxes: Tensor | None = None,
         image_index: Tensor | None = None,
         object_index: Tensor | None = None,
+        meshes: Sequence[Mesh] | Mesh | None = None,
     ) -> PoseEstimates:
         """Estimate one pose for each mask (or box).
 
@@ -93,6 +106,7 @@ class FoundPose(nn.Module):
             boxes: (B, 4) as ``(left, top, right, bottom)`` pixel edges, in place of masks or beside them.
             image_index: (B,) which image each mask belongs to; may be left out where B == N.
             object_index: (B,) which object each mask shows; may be left out for a single object.
+            meshes: the objects' meshes, in the order of ``objects``, for refiners that render.
 
         Raises:
             ValueError: shapes that do not fit, or an object that was onboarded with another extractor or size
@@ -118,7 +132,29 @@ class FoundPose(nn.Module):
             raw = select_query_patches(features, crops, self.extractor)
             query, templates, correspondences = self._match(objects, members, raw)
             hypotheses, candidates = self._solve(correspondences, crops)
-            return _choose(crops, query, templates, correspondences, hypotheses, candidates)
+            estimates = choose_coarse(crops, query, templates, correspondences, hypotheses, candidates)
+            if self.refiner is None:
+                return estimates
+            rank = hypotheses_to_refine(estimates, self.refine)
+            proposals = PoseProposals(
+                T_crop_from_model=torch.take_along_dim(
+                    hypotheses.T_crop_from_model, rank[..., None, None], dim=1
+                ),
+                score=hypotheses.num_inliers.gather(1, rank).to(crops.K_crop.dtype),
+                valid=(hypotheses.status.gather(1, rank) == PoseStatus.OK) & crops.valid[:, None],
+                template_index=templates.index.gather(1, rank),
+                crops=crops,
+                features=features,
+                stride=self.extractor.stride,
+                offset=self.extractor.offset,
+                objects=objects,
+                object_index=_object_of_each_crop(members),
+                images=images,
+                K=K,
+                image_index=torch.arange(len(crops.images)) if image_index is None else image_index,
+                meshes=[meshes] if isinstance(meshes, Mesh) else meshes,
+            )
+            return choose_refined(estimates, proposals, self.refiner(proposals), rank)
 
     def _check_objects(self, objects: list[ObjectRepresentation]) -> None:
         if not objects:
@@ -252,43 +288,6 @@ def select_query_patches(features: PatchFeatures, crops: Crops, extractor: Patch
     return QueryPatches(descriptors, pixels.reshape(-1, 2)[order], valid.gather(1, order), features.cls)
 
 
-def _choose(
-    crops: Crops,
-    query: QueryPatches,
-    templates: RetrievedTemplates,
-    correspondences: Correspondences,
-    hypotheses: PoseHypotheses,
-    candidates: PoseCandidates | None,
-) -> PoseEstimates:
-    """Keep the hypothesis with the most inliers; of equal ones, that of the more similar template."""
-    B, h = hypotheses.num_inliers.shape
-    solved = hypotheses.status == PoseStatus.OK
-    quality = torch.where(solved, hypotheses.num_inliers, torch.full_like(hypotheses.num_inliers, -1))
-    rank = torch.arange(h, device=quality.device)
-    best = (quality * h + (h - 1 - rank)).argmax(dim=1)
-    row = torch.arange(B, device=best.device)
-    status = hypotheses.status[row, best]
-    status = torch.where(query.valid.any(dim=1), status, torch.full_like(status, PoseStatus.NO_PATCHES))
-    status = torch.where(crops.valid, status, torch.full_like(status, PoseStatus.UNUSABLE_MASK))
-    valid = status == PoseStatus.OK
-    num_inliers = hypotheses.num_inliers[row, best] * valid
-    return PoseEstimates(
-        T_camera_from_model=invert_transform(crops.T_crop_from_camera)
-        @ hypotheses.T_crop_from_model[row, best],
-        score=num_inliers / query.valid.sum(dim=1).clamp(min=1),
-        num_inliers=num_inliers,
-        valid=valid,
-        status=status,
-        best=best,
-        crops=crops,
-        query=query,
-        templates=templates,
-        correspondences=correspondences,
-        hypotheses=hypotheses,
-        candidates=candidates,
-    )
-
-
 def _members(object_index: Tensor | None, count: int, num_objects: int) -> list[Tensor]:
     """Crops of each object, as index tensors."""
     if object_index is None:
@@ -303,6 +302,14 @@ def _members(object_index: Tensor | None, count: int, num_objects: int) -> list[
     if count and (int(labels.min()) < 0 or int(labels.max()) >= num_objects):
         raise ValueError(f"object_index must lie in [0, {num_objects}), got {labels.tolist()}")
     return [torch.nonzero(labels == i).flatten() for i in range(num_objects)]
+
+
+def _object_of_each_crop(members: list[Tensor]) -> Tensor:
+    """(B,) from the crops of each object."""
+    index = torch.empty(sum(len(rows) for rows in members), dtype=torch.int64)
+    for i, rows in enumerate(members):
+        index[rows] = i
+    return index
 
 
 def _take_rows(part: _Fields, rows: Tensor) -> _Fields:

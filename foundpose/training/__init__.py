@@ -7,6 +7,22 @@ from foundpose.training.adapter import AdapterTraining, PairLoss, PairPoses
 from foundpose.training.data import EpochShuffle, PairDataModule
 from foundpose.training.evaluation import PoseErrors, compare, evaluate_scenes, summarize
 from foundpose.training.pairs import PairBatch, PairSettings, PatchPairs, make_pairs
+from foundpose.training.refiner import RefinerLoss, RefinerTraining, disentangled_error
+from foundpose.training.refiner_data import (
+    EndlessShuffle,
+    Perturbation,
+    PictureSettings,
+    RefinerBatch,
+    RefinerDataModule,
+    RefinerPictures,
+    RendererPerMesh,
+)
+from foundpose.training.refiner_evaluation import (
+    RefinementErrors,
+    compare_refinement,
+    evaluate_refiner,
+    summarize_refinement,
+)
 from foundpose.training.views import (
     TemplateViews,
     TrueCrops,
@@ -17,6 +33,7 @@ from foundpose.training.views import (
 
 __all__ = [
     "AdapterTraining",
+    "EndlessShuffle",
     "EpochShuffle",
     "PairBatch",
     "PairDataModule",
@@ -24,14 +41,27 @@ __all__ = [
     "PairPoses",
     "PairSettings",
     "PatchPairs",
+    "Perturbation",
+    "PictureSettings",
     "PoseErrors",
+    "RefinementErrors",
+    "RefinerBatch",
+    "RefinerDataModule",
+    "RefinerLoss",
+    "RefinerPictures",
+    "RefinerTraining",
+    "RendererPerMesh",
     "TemplateViews",
     "TrueCrops",
     "compare",
+    "compare_refinement",
+    "disentangled_error",
+    "evaluate_refiner",
     "evaluate_scenes",
     "make_pairs",
     "nearby_rotations",
     "render_crops",
     "render_templates",
     "summarize",
+    "summarize_refinement",
 ]

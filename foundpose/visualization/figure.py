@@ -12,7 +12,7 @@ from foundpose.estimates import PoseEstimates, PoseStatus
 from foundpose.io import write_atomically
 from foundpose.onboarding import ObjectRepresentation
 from foundpose.rendering import Mesh, Renderer
-from foundpose.visualization.overlay import COARSE, TRUTH, draw_axes, draw_contour
+from foundpose.visualization.overlay import COARSE, REFINED, TRUTH, draw_axes, draw_contour
 
 _MOST_LINES = 60
 _MOST_TEMPLATES = 7
@@ -23,17 +23,19 @@ def overlay_pose(
     K: Tensor,
     mesh: Mesh,
     renderer: Renderer,
-    T_camera_from_model: Tensor,
+    T_coarse: Tensor,
+    T_refined: Tensor | None = None,
     T_true: Tensor | None = None,
 ) -> Tensor:
-    """Draw the contour (coarse: blue, truth: red) and the axes of a pose on its picture (3, H, W)."""
+    """Draw contours (truth: red, coarse: blue, refined: green) on a picture (3, H, W), and the final pose's axes."""
     size = (int(image.shape[1]), int(image.shape[2]))
     drawn = image
-    for T, color in ((T_true, TRUTH), (T_camera_from_model, COARSE)):
+    for T, color in ((T_true, TRUTH), (T_coarse, COARSE), (T_refined, REFINED)):
         if T is not None:
             mask = renderer(mesh, T[None].float(), K[None].float(), size).mask[0].to(image.device)
             drawn = draw_contour(drawn, mask, color)
-    return draw_axes(drawn, T_camera_from_model, K, length=0.5 * float(mesh.diameter))
+    final = T_coarse if T_refined is None else T_refined
+    return draw_axes(drawn, final, K, length=0.5 * float(mesh.diameter))
 
 
 @torch.no_grad()
@@ -79,7 +81,8 @@ def save_estimate_figure(
     left, right = top.subplots(1, 2, width_ratios=[image.shape[2] / image.shape[1], 1])
     drawn = image
     if bool(e.valid[index]):
-        drawn = overlay_pose(image, K, mesh, renderer, e.T_camera_from_model[index].cpu(), T_true)
+        refined = None if e.refined is None else e.T_camera_from_model[index].cpu()
+        drawn = overlay_pose(image, K, mesh, renderer, e.T_coarse[index].cpu(), refined, T_true)
     _show(left, drawn, f"{representation.info.name}: {status.name}, {int(e.num_inliers[index])} inliers")
     crop = draw_contour(
         e.crops.images[index].cpu(), e.crops.masks[index].cpu() > 0.5, (1.0, 1.0, 1.0), width=1

@@ -13,6 +13,7 @@ Color = tuple[float, float, float]
 # The paper's colours of contours.
 TRUTH: Color = (1.0, 0.1, 0.1)
 COARSE: Color = (0.2, 0.45, 1.0)
+REFINED: Color = (0.1, 0.85, 0.2)
 
 
 def draw_contour(image: Tensor, mask: Tensor, color: Color, width: int = 2) -> Tensor:

@@ -1,0 +1,28 @@
+"""Pose refinement: featuremetric alignment, the refiner contract, learned refiners."""
+
+from foundpose.refinement.base import PoseProposals, PoseRefiner, RefinedPoses
+from foundpose.refinement.featuremetric import Alignment, AlignmentProblem, FeaturemetricAlignment
+from foundpose.refinement.interpolation import sample_features
+from foundpose.refinement.network import UpdateNetwork
+from foundpose.refinement.pose_update import apply_update, rotation_from_6d, rotation_to_6d, update_between
+from foundpose.refinement.refiners import FeaturemetricRefiner, RefinerChain, alignment_problem
+from foundpose.refinement.render_and_compare import RenderAndCompareRefiner
+
+__all__ = [
+    "Alignment",
+    "AlignmentProblem",
+    "FeaturemetricAlignment",
+    "FeaturemetricRefiner",
+    "PoseProposals",
+    "PoseRefiner",
+    "RefinedPoses",
+    "RefinerChain",
+    "RenderAndCompareRefiner",
+    "UpdateNetwork",
+    "alignment_problem",
+    "apply_update",
+    "rotation_from_6d",
+    "rotation_to_6d",
+    "sample_features",
+    "update_between",
+]

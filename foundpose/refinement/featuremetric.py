@@ -1,0 +1,304 @@
+"""Alignment of template descriptors with a feature map: the cost, its normal equations and its minimum."""
+
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from foundpose.optimization import (
+    BarronLoss,
+    Differentiation,
+    Huber,
+    NormalEquations,
+    RobustLoss,
+    optimise_pose,
+)
+from foundpose.optimization.cholesky import scaled_cholesky
+from foundpose.optimization.implicit import check_differentiation
+from foundpose.pnp.polish import LocalFrame, project_in_frame
+from foundpose.refinement.interpolation import Interpolation, sample_features
+
+ResidualKind = Literal["channel", "norm"]
+
+
+class AlignmentProblem(NamedTuple):
+    """What n poses are aligned with.
+
+    Attributes:
+        features: (m, h, w, d) projected feature maps of crops, channels last.
+        map_index: (n,) which map belongs to each pose, int64.
+        stride: distance of the map's cells in pixels.
+        offset: pixel coordinate of the first cell's centre.
+        image_size: side of the crops in pixels.
+        K: (n, 3, 3) intrinsics of the crops.
+        descriptors: (n, P, d) of the template's patches.
+        points_model: (n, P, 3) mesh units.
+        valid: (n, P) bool.
+    """
+
+    features: Tensor
+    map_index: Tensor
+    stride: float
+    offset: float
+    image_size: int
+    K: Tensor
+    descriptors: Tensor
+    points_model: Tensor
+    valid: Tensor
+
+
+class Alignment(NamedTuple):
+    """Aligned poses.
+
+    Attributes:
+        T_crop_from_model: (n, 4, 4), mesh units; the initial pose, bit for bit, where the cost did not fall.
+        cost: (n,) mean ρ over the template's patches.
+        initial_cost: (n,) the same at the initial pose.
+        relative_cost: (n,) cost as a share of what it would be if no patch were seen, in [0, 1] for a loss with a
+            ceiling.
+        iterations: (n,) int64.
+        converged: (n,) bool.
+        failed: (n,) bool, there is nothing to align (no patch in sight, or numbers that are not finite).
+        covariance: (n, 6, 6) of the left twist (v, ω) in the crop's frame, in mesh units and radians, with the
+            variance of a channel estimated from the residuals as if channels and patches were independent (they are
+            not: it is too small, but tells directions apart). Infinite where undetermined. A constant for autograd.
+    """
+
+    T_crop_from_model: Tensor
+    cost: Tensor
+    initial_cost: Tensor
+    relative_cost: Tensor
+    iterations: Tensor
+    converged: Tensor
+    failed: Tensor
+    covariance: Tensor
+
+
+class FeaturemetricAlignment(nn.Module):
+    """Moves poses so that template patches, projected into a crop, meet descriptors like their own.
+
+    Minimises the mean of ``ρ(F(π(R x_i + t)) − p_i)`` over all patches i of a template by Levenberg-Marquardt, at
+    most 30 iterations. A patch that leaves the crop or falls behind the camera counts the ceiling of ρ, so losing
+    patches never looks like progress.
+
+    Args:
+        loss: robust loss ρ on squared residuals; None means ``BarronLoss(-5.0, 0.5)``, the paper's. Its scale c is in
+            the unit of the descriptors and should be about the residual that a right match leaves in one channel
+            (``residual="norm"``: in the norm): c = 0.5 suits DINOv2. For other descriptors take the median residual
+            at right poses, or set ``auto_scale``.
+        residual: "channel": ρ of each channel's residual, summed. "norm": ρ of the residual's length.
+        normalize: compare descriptors of unit length.
+        auto_scale: take for c, whatever the loss's own is, the residuals' robust standard deviation at the initial
+            pose (1.4826 times their median magnitude), for each pose.
+        interpolation: of the feature map; "bicubic" has continuous slopes.
+        max_iterations: upper limit on the steps tried.
+        tolerance: relative decrease of the cost that counts as converged.
+        differentiation: gradient of the optimum ("implicit") or of the steps ("unrolled").
+
+    Raises:
+        ValueError: a setting out of range.
+
+    Source: paper, "Featuremetric pose refinement".
+    """
+
+    def __init__(
+        self,
+        loss: RobustLoss | None = None,
+        residual: ResidualKind = "channel",
+        normalize: bool = False,
+        auto_scale: bool = False,
+        interpolation: Interpolation = "bilinear",
+        max_iterations: int = 30,
+        tolerance: float = 1e-5,
+        differentiation: Differentiation = "implicit",
+    ) -> None:
+        super().__init__()
+        loss = BarronLoss(-5.0, 0.5) if loss is None else loss
+        if residual not in ("channel", "norm"):
+            raise ValueError(f"residual must be 'channel' or 'norm', got {residual!r}")
+        if interpolation not in ("bilinear", "bicubic"):
+            raise ValueError(f"interpolation must be 'bilinear' or 'bicubic', got {interpolation!r}")
+        if max_iterations < 1 or not tolerance >= 0:
+            raise ValueError(
+                f"max_iterations must be at least 1 and tolerance not negative, got {max_iterations} and {tolerance}"
+            )
+        if auto_scale and not isinstance(loss, BarronLoss | Huber):
+            raise ValueError(f"auto_scale needs a loss with a scale, got {type(loss).__name__}")
+        check_differentiation(differentiation)
+        self.loss = loss
+        self.residual: ResidualKind = residual
+        self.normalize = normalize
+        self.auto_scale = auto_scale
+        self.interpolation: Interpolation = interpolation
+        self.max_iterations = max_iterations
+        self.tolerance = tolerance
+        self.differentiation: Differentiation = differentiation
+
+    def forward(self, T_crop_from_model: Tensor, problem: AlignmentProblem) -> Alignment:
+        """Align n poses.
+
+        Args:
+            T_crop_from_model: (n, 4, 4) initial poses.
+            problem: what they are aligned with.
+
+        Returns:
+            An :class:`Alignment`.
+
+        Differentiable w.r.t. the feature maps, descriptors, 3D points, ``K`` and the loss's parameters, in mode
+        "unrolled" also w.r.t. the initial poses; ``T_crop_from_model`` and the costs carry the gradient. Which cells
+        are read, and which patches are lost, is constant, and so is an automatic scale.
+        """
+        T = T_crop_from_model
+        sane = torch.isfinite(T.detach()).all(-1).all(-1)
+        start = torch.where(sane[:, None, None], T, torch.eye(4, dtype=T.dtype, device=T.device))
+        valid = problem.valid & sane.unsqueeze(-1)
+        problem = problem._replace(
+            valid=valid,
+            descriptors=problem.descriptors.masked_fill(~valid.unsqueeze(-1), 0.0),
+            points_model=problem.points_model.masked_fill(~valid.unsqueeze(-1), 0.0),
+        )
+        if self.normalize:
+            problem = problem._replace(
+                features=nn.functional.normalize(problem.features, dim=-1),
+                descriptors=nn.functional.normalize(problem.descriptors, dim=-1),
+            )
+        if self.differentiation == "implicit":
+            # The minimum depends neither on the start nor on the frame.
+            start = start.detach()
+            frame = LocalFrame.at(start, problem.points_model.detach(), valid.to(T.dtype))
+        else:
+            frame = LocalFrame.at(start, problem.points_model, valid.to(T.dtype))
+        points_local = frame.points(problem.points_model)
+        start_local = frame.pose_to_local(start)
+        unit = self._unit(start_local, points_local, problem, frame)
+        descriptors = problem.descriptors.detach()
+        ceiling = self._ceiling(descriptors if unit is None else descriptors * unit[:, None, None])
+
+        def evaluate(T_local: Tensor) -> NormalEquations:
+            return self._equations(T_local, points_local, problem, frame, unit, ceiling)[0]
+
+        result = optimise_pose(
+            evaluate,
+            start_local,
+            differentiation=self.differentiation,
+            max_iterations=self.max_iterations,
+            tolerance=self.tolerance,
+        )
+        seen = self._equations(result.T.detach(), points_local, problem, frame, unit, ceiling)
+        improved = ~result.failed & (result.cost < result.initial_cost)
+        T_final = torch.where(improved[:, None, None], frame.pose_from_local(result.T), T)
+        count = valid.sum(-1).clamp(min=1)
+        most = ceiling.masked_fill(~valid, 0.0).sum(-1) / count
+        # The equations have the half of the mean of ρ.
+        cost, initial = 2.0 * result.cost, 2.0 * result.initial_cost
+        return Alignment(
+            T_crop_from_model=T_final,
+            cost=cost,
+            initial_cost=initial,
+            relative_cost=cost / most.clamp(min=torch.finfo(T.dtype).tiny),
+            iterations=result.iterations,
+            converged=result.converged,
+            failed=result.failed,
+            covariance=_covariance(result.H.detach(), seen[1], seen[2], count, frame),
+        )
+
+    def _loss_scale(self) -> Tensor | float:
+        """c of the loss."""
+        assert isinstance(self.loss, BarronLoss | Huber)
+        return self.loss.scale
+
+    def _unit(
+        self, T_local: Tensor, points_local: Tensor, problem: AlignmentProblem, frame: LocalFrame
+    ) -> Tensor | None:
+        """Factors (n,) that bring residuals to the loss's unit; None without an automatic scale."""
+        if not self.auto_scale:
+            return None
+        with torch.no_grad():
+            residual, _, seen, _ = _residuals(T_local, points_local, problem, frame, self.interpolation)
+            size = residual.abs()
+            if self.residual == "norm":
+                size = torch.linalg.vector_norm(residual, dim=-1, keepdim=True)
+            size = size.masked_fill(~seen.unsqueeze(-1), torch.nan).flatten(1)
+            spread = 1.4826 * size.nanmedian(dim=1).values
+            scale = torch.as_tensor(self._loss_scale(), dtype=spread.dtype, device=spread.device)
+            return torch.where(spread > 0, scale / spread, torch.ones_like(spread))
+
+    def _ceiling(self, descriptors: Tensor) -> Tensor:
+        """Cost (n, P) of a patch that is not seen."""
+        if isinstance(self.loss, BarronLoss) and bool(self.loss.alpha < 0):
+            channels = descriptors.shape[-1] if self.residual == "channel" else 1
+            return (channels * self.loss.ceiling.to(descriptors.dtype)).expand(descriptors.shape[:2])
+        # A loss without a ceiling: as if the crop showed the opposite of what the patch looks like.
+        squared = (2.0 * descriptors).square()
+        if self.residual == "norm":
+            squared = squared.sum(-1, keepdim=True)
+        return self.loss(squared)[0].sum(-1)
+
+    def _equations(
+        self,
+        T_local: Tensor,
+        points_local: Tensor,
+        problem: AlignmentProblem,
+        frame: LocalFrame,
+        unit: Tensor | None,
+        ceiling: Tensor,
+    ) -> tuple[NormalEquations, Tensor, Tensor]:
+        """Normal equations of ½ mean ρ; weighted sum of squared residuals (n,) and sum of weights (n,)."""
+        residual, slopes, seen, J = _residuals(T_local, points_local, problem, frame, self.interpolation)
+        if unit is not None:
+            residual, slopes = residual * unit[:, None, None], slopes * unit[:, None, None, None]
+        squared = residual.square()
+        if self.residual == "norm":
+            squared = squared.sum(-1, keepdim=True)
+        rho, weight = self.loss(squared)
+        count = problem.valid.sum(-1).clamp(min=1).to(rho.dtype)
+        lost = problem.valid & ~seen
+        cost = torch.where(seen, rho.sum(-1), torch.where(lost, ceiling, torch.zeros_like(ceiling)))
+        weight = weight * (seen / count.unsqueeze(-1)).unsqueeze(-1)
+        # Two rows a patch, however many channels there are.
+        weighted = slopes * weight.unsqueeze(-2)
+        gram = weighted @ slopes.transpose(-1, -2)  # (n, P, 2, 2)
+        pull = (weighted @ residual.unsqueeze(-1)).squeeze(-1)  # (n, P, 2)
+        H = (gram @ J).flatten(1, 2).transpose(-1, -2) @ J.flatten(1, 2)
+        g = (J.flatten(1, 2).transpose(-1, -2) @ pull.flatten(1).unsqueeze(-1)).squeeze(-1)
+        energy = (weight * squared).sum((-1, -2)).detach()
+        return NormalEquations(0.5 * cost.sum(-1) / count, H, g), energy, weight.sum((-1, -2)).detach()
+
+    def extra_repr(self) -> str:
+        """Settings, for printing."""
+        return (
+            f"residual={self.residual!r}, normalize={self.normalize}, auto_scale={self.auto_scale}, "
+            f"interpolation={self.interpolation!r}, max_iterations={self.max_iterations}, "
+            f"tolerance={self.tolerance}, differentiation={self.differentiation!r}"
+        )
+
+
+def _residuals(
+    T_local: Tensor,
+    points_local: Tensor,
+    problem: AlignmentProblem,
+    frame: LocalFrame,
+    interpolation: Interpolation,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Residuals (n, P, d), their slopes along columns and rows of the map (n, P, 2, d), which patches are seen
+    (n, P), and derivatives of the map's coordinates in the pose (n, P, 2, 6)."""
+    pixels, depth, J = project_in_frame(T_local, points_local, problem.K, frame)
+    inside = ((pixels >= -0.5) & (pixels <= problem.image_size - 0.5)).all(-1)
+    seen = problem.valid & (depth > 0) & inside
+    pixels = torch.where(seen.unsqueeze(-1), pixels, torch.zeros_like(pixels))
+    position = (pixels - problem.offset) / problem.stride
+    sampled = sample_features(problem.features, problem.map_index, position, interpolation)
+    residual = sampled[..., 0, :] - problem.descriptors
+    J = torch.where(seen[..., None, None], J, torch.zeros_like(J)) / problem.stride
+    return residual, sampled[..., 1:, :], seen, J
+
+
+def _covariance(H: Tensor, energy: Tensor, weights: Tensor, count: Tensor, frame: LocalFrame) -> Tensor:
+    """Covariance (n, 6, 6) in the crop's frame from the equations of the mean."""
+    system = scaled_cholesky(H, H.diagonal(dim1=-2, dim2=-1))
+    freedom = weights * count - 6.0
+    variance = energy / freedom.clamp(min=torch.finfo(H.dtype).eps)
+    to_crop = frame.twist_to_camera()
+    covariance = variance[:, None, None] * (to_crop @ system.inverse() @ to_crop.transpose(-1, -2))
+    unknown = torch.diag_embed(torch.full_like(H[:, 0], torch.inf))
+    return torch.where((system.usable & (freedom > 0.5))[:, None, None], covariance, unknown)

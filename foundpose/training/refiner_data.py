@@ -1,0 +1,332 @@
+"""Pictures of objects with perturbed poses: what a learned refiner is trained and measured on."""
+
+import copy
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import pytorch_lightning as pl
+import torch
+from kornia.geometry.conversions import axis_angle_to_rotation_matrix
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset, Sampler
+
+from foundpose.geometry import PerspectiveCrop, make_transform
+from foundpose.onboarding import Progress
+from foundpose.rendering import Mesh, Renderer, RenderOutput
+from foundpose.synthetic import LightVariation, combine_seeds
+from foundpose.training.views import render_crops
+
+_CHUNK = 16  # scenes that are drawn at a time
+
+
+@dataclass(frozen=True)
+class Perturbation:
+    """How far initial poses are from the truth; standard deviations of normal distributions.
+
+    Args:
+        rotation: about each of the camera's axes, degrees.
+        lateral: shift of the object's centre in x and y, as a share of its depth.
+        depth: logarithm of the ratio of depths, so 0.05 is about 5 %.
+
+    Raises:
+        ValueError: a negative number.
+    """
+
+    rotation: float = 15.0
+    lateral: float = 0.02
+    depth: float = 0.05
+
+    def __post_init__(self) -> None:
+        if not min(self.rotation, self.lateral, self.depth) >= 0.0:
+            raise ValueError(
+                "rotation, lateral and depth must not be negative, got "
+                f"{self.rotation}, {self.lateral} and {self.depth}"
+            )
+
+    def __call__(self, T_camera_from_model: Tensor, centre: Tensor, seeds: Sequence[int]) -> Tensor:
+        """Perturb poses (B, 4, 4) of objects with centres (B, 3); each by a draw of its own seed."""
+        draws = torch.stack([torch.randn(6, generator=torch.Generator().manual_seed(seed)) for seed in seeds])
+        draws = draws.to(T_camera_from_model)
+        turn = axis_angle_to_rotation_matrix(math.radians(self.rotation) * draws[:, :3])
+        R = turn @ T_camera_from_model[:, :3, :3]
+        x, y, z = _transform(T_camera_from_model, centre).unbind(-1)
+        depth = z * torch.exp(self.depth * draws[:, 5])
+        moved = torch.stack([x / z + self.lateral * draws[:, 3], y / z + self.lateral * draws[:, 4]], -1)
+        moved = torch.cat([moved * depth[:, None], depth[:, None]], dim=-1)
+        return make_transform(R, moved - (R @ centre.unsqueeze(-1)).squeeze(-1))
+
+
+@dataclass(frozen=True)
+class PictureSettings:
+    """The pictures.
+
+    Args:
+        pictures_per_mesh: number of scenes of each mesh.
+        size: side of a picture in pixels: the part of the scene around the object.
+        fill: share of the side that the visible part of the object takes.
+        occlusion: hide a corner of the object.
+        light: how the light varies; None for always the same.
+        scene: height and width of the scenes in pixels; the object takes about half of the height.
+
+    Raises:
+        ValueError: no pictures.
+    """
+
+    pictures_per_mesh: int = 60
+    size: int = 176
+    fill: float = 0.45
+    occlusion: bool = True
+    light: LightVariation | None = None
+    scene: tuple[int, int] = (240, 320)
+
+    def __post_init__(self) -> None:
+        if self.pictures_per_mesh < 1:
+            raise ValueError(f"pictures_per_mesh must be at least 1, got {self.pictures_per_mesh}")
+
+
+class RefinerBatch(NamedTuple):
+    """B pictures with true and perturbed poses.
+
+    Attributes:
+        images: (B, 3, H, W) in [0, 1].
+        K: (B, 3, 3) pixels.
+        T_true: (B, 4, 4) ``T_camera_from_model``, mesh units.
+        T_start: (B, 4, 4) the perturbed ones.
+        mesh_index: (B,) int64.
+        meshes: all meshes.
+        surface: (B, P, 3) points of the surface, mesh units.
+        diameter: (B,) mesh units.
+    """
+
+    images: Tensor
+    K: Tensor
+    T_true: Tensor
+    T_start: Tensor
+    mesh_index: Tensor
+    meshes: list[Mesh]
+    surface: Tensor
+    diameter: Tensor
+
+
+class RefinerPictures(Dataset[RefinerBatch]):
+    """Pictures in memory; item k is picture ``k % count`` with the k-th perturbation, so there is no last item.
+
+    Args:
+        meshes: the objects.
+        settings: of the pictures.
+        perturbation: of the poses.
+        renderer: draws the scenes.
+        seed: of scenes and perturbations.
+        surface_points: points of each mesh for the loss.
+        progress: is told how far rendering has come.
+
+    Raises:
+        ValueError: no meshes.
+    """
+
+    def __init__(
+        self,
+        meshes: Sequence[Mesh],
+        settings: PictureSettings,
+        perturbation: Perturbation,
+        renderer: Renderer,
+        seed: int = 0,
+        surface_points: int = 256,
+        progress: Progress | None = None,
+    ) -> None:
+        if not meshes:
+            raise ValueError("meshes is empty: give at least one")
+        self.meshes = list(meshes)
+        self.perturbation = perturbation
+        self.seed = seed
+        crop = PerspectiveCrop(settings.size, settings.fill)
+        count = settings.pictures_per_mesh
+        pictures, cameras, poses = [], [], []
+        for number, mesh in enumerate(self.meshes):
+            for start in range(0, count, _CHUNK):
+                seeds = [combine_seeds(seed, number, k) for k in range(start, min(start + _CHUNK, count))]
+                found = render_crops(
+                    mesh, seeds, crop, renderer, settings.light, settings.occlusion, *settings.scene
+                )
+                pictures.append((found.crops.images * 255.0).round().to(torch.uint8))
+                cameras.append(found.crops.K_crop)
+                poses.append(found.T_crop_from_model)
+                if progress is not None:
+                    progress("pictures", number * count + start + len(seeds), len(self.meshes) * count)
+        self.images = torch.cat(pictures)
+        self.K = torch.cat(cameras)
+        self.T_true = torch.cat(poses)
+        self.mesh_index = torch.arange(len(self.meshes)).repeat_interleave(count)
+        self.surface = torch.stack([_spread(mesh.vertices, surface_points) for mesh in self.meshes])
+        self.diameter = torch.tensor([mesh.diameter for mesh in self.meshes])
+        self.centre = torch.stack([mesh.bounds.mean(0) for mesh in self.meshes])
+
+    def __len__(self) -> int:
+        """Number of pictures."""
+        return len(self.images)
+
+    def __getitem__(self, k: int) -> RefinerBatch:
+        """Item k as a batch of one."""
+        return self.__getitems__([k])
+
+    def __getitems__(self, keys: Sequence[int]) -> RefinerBatch:
+        """Several items as a batch."""
+        rows = torch.tensor([k % len(self) for k in keys])
+        mesh_index, T_true = self.mesh_index[rows], self.T_true[rows]
+        seeds = [combine_seeds(self.seed, 1, k) for k in keys]
+        return RefinerBatch(
+            images=self.images[rows].float() / 255.0,
+            K=self.K[rows],
+            T_true=T_true,
+            T_start=self.perturbation(T_true, self.centre[mesh_index], seeds),
+            mesh_index=mesh_index,
+            meshes=self.meshes,
+            surface=self.surface[mesh_index],
+            diameter=self.diameter[mesh_index],
+        )
+
+
+class EndlessShuffle(Sampler[int]):
+    """Each epoch all pictures in a new order with new perturbations; a resumed training goes on as it would have.
+
+    Args:
+        count: number of pictures.
+        seed: of the order.
+        passes: how often each picture is shown in an epoch.
+    """
+
+    def __init__(self, count: int, seed: int, passes: int = 1) -> None:
+        self.count = count
+        self.seed = seed
+        self.passes = passes
+        self.epoch = 0
+
+    def set_epoch(self, epoch: int) -> None:
+        """Lightning calls this before every epoch."""
+        self.epoch = epoch
+
+    def __len__(self) -> int:
+        return self.count * self.passes
+
+    def __iter__(self) -> Iterator[int]:
+        for number in range(self.epoch * self.passes, (self.epoch + 1) * self.passes):
+            generator = torch.Generator().manual_seed(combine_seeds(self.seed, number))
+            order = torch.randperm(self.count, generator=generator)
+            yield from (order + number * self.count).tolist()
+
+
+class RefinerDataModule(pl.LightningDataModule):
+    """Renders the pictures once, at first need, and deals them out in batches with ever new perturbations.
+
+    Args:
+        meshes: objects to train on.
+        validation_meshes: other objects, for the validation loss; may be empty.
+        renderer: draws the scenes.
+        pictures: what the pictures are like.
+        perturbation: of the poses.
+        batch_size: pictures in a batch.
+        passes: how often each picture is shown in an epoch.
+        seed: of scenes, perturbations and order.
+        surface_points: points of each mesh for the loss.
+        progress: is told how far rendering has come.
+
+    Raises:
+        ValueError: no meshes, no batch or no pass.
+    """
+
+    def __init__(
+        self,
+        meshes: Sequence[Mesh],
+        validation_meshes: Sequence[Mesh],
+        renderer: Renderer,
+        pictures: PictureSettings,
+        perturbation: Perturbation,
+        batch_size: int = 32,
+        passes: int = 1,
+        seed: int = 0,
+        surface_points: int = 256,
+        progress: Progress | None = None,
+    ) -> None:
+        super().__init__()
+        if not meshes:
+            raise ValueError("meshes is empty: give at least one to train on")
+        if batch_size < 1 or passes < 1:
+            raise ValueError(f"batch_size and passes must be at least 1, got {batch_size} and {passes}")
+        self.meshes = list(meshes)
+        self.validation_meshes = list(validation_meshes)
+        self.renderer = renderer
+        self.pictures = pictures
+        self.perturbation = perturbation
+        self.batch_size = batch_size
+        self.passes = passes
+        self.seed = seed
+        self.surface_points = surface_points
+        self.progress = progress
+        self.training: RefinerPictures | None = None
+        self.validation: RefinerPictures | None = None
+
+    def setup(self, stage: str | None = None) -> None:
+        """Render the pictures."""
+        if self.training is None:
+            self.training = self._make(self.meshes, self.seed)
+        if self.validation is None and self.validation_meshes:
+            self.validation = self._make(self.validation_meshes, combine_seeds(self.seed, 1))
+
+    def _make(self, meshes: Sequence[Mesh], seed: int) -> RefinerPictures:
+        return RefinerPictures(
+            meshes, self.pictures, self.perturbation, self.renderer, seed, self.surface_points, self.progress
+        )
+
+    def train_dataloader(self) -> DataLoader[RefinerBatch]:
+        """All pictures in a new order, with new perturbations, each epoch."""
+        assert self.training is not None, "call setup first"
+        sampler = EndlessShuffle(len(self.training), self.seed, self.passes)
+        return DataLoader(self.training, self.batch_size, sampler=sampler, collate_fn=_as_it_is)
+
+    def val_dataloader(self) -> list[DataLoader[RefinerBatch]]:
+        """All validation pictures with one perturbation each, or nothing."""
+        if self.validation is None:
+            return []
+        return [DataLoader(self.validation, self.batch_size, collate_fn=_as_it_is)]
+
+
+class RendererPerMesh(Renderer):
+    """Renders as another renderer does, with a copy of it for each mesh, so that none sets up a mesh twice.
+
+    Renderers keep what they built for the last few meshes; training goes round more.
+
+    Args:
+        renderer: what to copy.
+    """
+
+    def __init__(self, renderer: Renderer) -> None:
+        super().__init__(renderer.supersampling, renderer.ambient)
+        self._copies: dict[str, Renderer] = {}
+        self._original = [renderer]  # no submodule
+
+    def forward(
+        self, mesh: Mesh, T_camera_from_model: Tensor, K: Tensor, size: tuple[int, int]
+    ) -> RenderOutput:
+        """As the other renderer's."""
+        if mesh.checksum not in self._copies:
+            self._copies[mesh.checksum] = copy.deepcopy(self._original[0])
+        return self._copies[mesh.checksum](mesh, T_camera_from_model, K, size)
+
+    def _render_views(self, *arguments: Any) -> None:
+        raise NotImplementedError("the copies render")
+
+
+def _transform(T: Tensor, points: Tensor) -> Tensor:
+    return (T[:, :3, :3] @ points.unsqueeze(-1)).squeeze(-1) + T[:, :3, 3]
+
+
+def _spread(vertices: Tensor, count: int) -> Tensor:
+    """``count`` of the vertices at even steps; small meshes repeat theirs."""
+    return vertices[torch.linspace(0, len(vertices) - 1, count).round().long()]
+
+
+def _as_it_is(batch: Any) -> Any:
+    """The data set makes batches itself."""
+    return batch

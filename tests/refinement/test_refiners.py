@@ -1,0 +1,187 @@
+import pytest
+import torch
+
+from foundpose import FoundPose, PoseStatus
+from foundpose.features import CoordinateCode
+from foundpose.geometry import PerspectiveCrop, rotation_angle
+from foundpose.matching import PatchMatcher
+from foundpose.optimization import BarronLoss
+from foundpose.pnp import RansacPnp
+from foundpose.refinement import (
+    FeaturemetricAlignment,
+    FeaturemetricRefiner,
+    PoseProposals,
+    PoseRefiner,
+    RefinedPoses,
+    RefinerChain,
+)
+from foundpose.refinement.convergence import nearest_templates, perturbed_poses, pose_deviation
+from foundpose.rendering import CoordinateRenderer
+from foundpose.rendering.coordinates import render_coordinate_image
+from foundpose.retrieval import SoftAssignBow, TemplateRetriever
+from foundpose.synthetic import procedural_mesh
+from tests.test_pipeline import SIZE, K, pose_at
+
+
+def make_pipeline(**changes) -> FoundPose:
+    parts = {
+        "crop": PerspectiveCrop(),
+        "extractor": CoordinateCode(),
+        "retriever": TemplateRetriever(SoftAssignBow()),
+        "matcher": PatchMatcher(),
+        "pnp": RansacPnp(),
+    }
+    return FoundPose(**parts | changes)
+
+
+def oracle_refiner(**settings) -> FeaturemetricRefiner:
+    """For codes of coordinates, whose few leading channels carry nearly all."""
+    return FeaturemetricRefiner(FeaturemetricAlignment(BarronLoss(-5.0, 0.5), residual="norm", **settings))
+
+
+@pytest.fixture(scope="module")
+def views(blob):
+    """Pictures of the blob from six sides, masks and true poses."""
+    T = torch.stack([pose_at(blob, (300.0 + 8 * k, 230.0 - 5 * k), 700.0, k) for k in range(6)])
+    images = torch.stack([render_coordinate_image(CoordinateRenderer(), [blob], [t], K, SIZE) for t in T])
+    masks = CoordinateRenderer()(blob, T, K[None], SIZE).mask
+    return images, masks, T
+
+
+def angles(T, T_true):
+    return torch.rad2deg(rotation_angle(T[:, :3, :3], T_true[:, :3, :3]))
+
+
+@pytest.mark.parametrize("refine", ["best", "all"])
+def test_refinement_improves_coarse_poses(views, oracle_blob, blob, refine):
+    images, masks, T_true = views
+    pipeline = make_pipeline(refiner=oracle_refiner(), refine=refine)
+    with torch.no_grad():
+        e = pipeline(images, K.expand(6, 3, 3), oracle_blob, masks=masks)
+        coarse = make_pipeline()(images, K.expand(6, 3, 3), oracle_blob, masks=masks)
+    assert e.valid.all()
+    before, after = angles(coarse.T_camera_from_model, T_true), angles(e.T_camera_from_model, T_true)
+    assert after.median() < 0.5 * before.median()
+    assert after.median() < 0.3
+    assert (after < before).float().mean() > 0.8
+    n = 1 if refine == "best" else 5
+    assert e.refined.score.shape == (6, n)
+    assert ((e.score > 0) & (e.score <= 1)).all()
+    torch.testing.assert_close(e.score, e.refined.score.amax(1))
+    if refine == "best":
+        assert torch.equal(e.best, coarse.best)
+        assert torch.equal(e.T_coarse, coarse.T_camera_from_model)
+    # The coarse pose told is that of the hypothesis that was chosen.
+    row = torch.arange(6)
+    T = e.crops.T_crop_from_camera @ e.T_coarse
+    torch.testing.assert_close(T, e.hypotheses.T_crop_from_model[row, e.best], rtol=1e-4, atol=1e-2)
+    assert torch.equal(e.num_inliers, e.hypotheses.num_inliers[row, e.best])
+
+
+def test_alone_as_in_a_batch_with_other_objects(views, oracle_blob, oracle_onboarder):
+    images, masks, _ = views
+    other_mesh = procedural_mesh(8, subdivisions=5)
+    other = oracle_onboarder(other_mesh, "other")
+    T = pose_at(other_mesh, (310.0, 220.0), 650.0, 5)[None]
+    image = render_coordinate_image(CoordinateRenderer(), [other_mesh], list(T), K, SIZE)
+    mask = CoordinateRenderer()(other_mesh, T, K[None], SIZE).mask
+    empty = torch.zeros_like(mask)
+    pipeline = make_pipeline(refiner=oracle_refiner(), refine="all")
+    with torch.no_grad():
+        together = pipeline(
+            torch.stack([images[0], image, images[1]]),
+            K.expand(3, 3, 3),
+            [oracle_blob, other],
+            masks=torch.cat([mask, masks[:1], empty, masks[1:2]]),
+            image_index=torch.tensor([1, 0, 0, 2]),
+            object_index=torch.tensor([1, 0, 0, 0]),
+        )
+        alone = pipeline(images[1:2], K[None], oracle_blob, masks=masks[1:2])
+        first = pipeline(image[None], K[None], other, masks=mask)
+    assert together.valid.tolist() == [True, True, False, True]
+    assert together.status[2] == PoseStatus.UNUSABLE_MASK
+    assert together.score[2] == 0
+    for single, b in ((alone, 3), (first, 0)):
+        torch.testing.assert_close(
+            single.T_camera_from_model[0], together.T_camera_from_model[b], rtol=1e-4, atol=2e-2
+        )
+        assert int(single.best[0]) == int(together.best[b])
+
+
+class Stubborn(PoseRefiner):
+    """Refuses everything."""
+
+    def forward(self, proposals: PoseProposals) -> RefinedPoses:
+        nothing = torch.zeros_like(proposals.valid)
+        return RefinedPoses(proposals.T_crop_from_model + 1.0, proposals.score + 7, nothing)
+
+
+def test_a_pose_that_cannot_be_refined_stays_as_it_was(views, oracle_blob):
+    images, masks, _ = views
+    with torch.no_grad():
+        e = make_pipeline(refiner=Stubborn())(images[:2], K.expand(2, 3, 3), oracle_blob, masks=masks[:2])
+        coarse = make_pipeline()(images[:2], K.expand(2, 3, 3), oracle_blob, masks=masks[:2])
+    assert torch.equal(e.T_camera_from_model, coarse.T_camera_from_model)
+    assert e.valid.all()
+    assert (e.score == 0).all()
+
+
+class Nudge(PoseRefiner):
+    """Moves poses by a unit along the optical axis and counts itself in the score."""
+
+    def forward(self, proposals: PoseProposals) -> RefinedPoses:
+        T = proposals.T_crop_from_model.clone()
+        T[..., 2, 3] += 1.0
+        return RefinedPoses(T, proposals.score + 1, proposals.valid)
+
+
+def test_a_chain_hands_poses_on(views, oracle_blob):
+    images, masks, _ = views
+    with torch.no_grad():
+        once = make_pipeline(refiner=oracle_refiner())(images[:1], K[None], oracle_blob, masks=masks[:1])
+        chain = RefinerChain([oracle_refiner(), Nudge(), Nudge()])
+        e = make_pipeline(refiner=chain)(images[:1], K[None], oracle_blob, masks=masks[:1])
+    moved = e.refined.T_crop_from_model - once.refined.T_crop_from_model
+    expected = torch.zeros(4, 4)
+    expected[2, 3] = 2.0
+    torch.testing.assert_close(moved[0, 0], expected, atol=1e-3, rtol=0)
+    torch.testing.assert_close(e.score, once.score + 2)
+    with pytest.raises(ValueError, match="refiners is empty"):
+        RefinerChain([])
+
+
+def test_gradients_pass_through_refinement(views, oracle_blob):
+    images, masks, T_true = views
+    picture = images[:1].clone().requires_grad_()
+    e = make_pipeline(refiner=oracle_refiner())(picture, K[None], oracle_blob, masks=masks[:1])
+    ((e.T_camera_from_model - T_true[:1])[:, :3].square().sum() + e.score.sum()).backward()
+    assert torch.isfinite(picture.grad).all()
+    assert picture.grad.abs().max() > 0
+
+
+def test_bad_arguments():
+    with pytest.raises(ValueError, match="refine must be one of"):
+        make_pipeline(refine="some")
+
+
+def test_deviations_and_perturbations():
+    generator = torch.Generator().manual_seed(0)
+    T = pose_at(procedural_mesh(3, subdivisions=3), (300.0, 230.0), 700.0, 0).expand(200, 4, 4)
+    degrees, distance = torch.linspace(0.5, 15, 200), torch.linspace(1, 20, 200)
+    moved = perturbed_poses(T, degrees, distance, generator)
+    found = pose_deviation(moved, T, diameter=100.0)
+    torch.testing.assert_close(found.rotation, degrees, atol=1e-2, rtol=0)
+    whole = (found.lateral.square() + found.depth.square()).sqrt()
+    torch.testing.assert_close(whole, distance / 100, atol=1e-4, rtol=0)
+    assert not found.converged()[50:].any()
+    assert pose_deviation(T, T, 100.0).converged().all()
+    # Directions are spread evenly: a third of the squared length lies along the sight.
+    assert abs((found.depth.square() / whole.square()).mean() - 1 / 3) < 0.08
+
+
+def test_nearest_templates(oracle_blob):
+    T = oracle_blob.T_template_from_model
+    pick = torch.tensor([3, 77, 12])
+    moved = T[pick].clone()
+    moved[:, :3, 3] *= 1.4  # the same view from farther away
+    assert torch.equal(nearest_templates(moved, T), pick)
