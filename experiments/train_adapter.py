@@ -28,7 +28,6 @@ from foundpose.geometry import Symmetries, stack_symmetries, symmetries_from_mod
 from foundpose.io import write_atomically
 from foundpose.progress import ProgressBars
 from foundpose.rendering import Mesh, load_mesh
-from foundpose.synthetic import procedural_mesh
 from foundpose.training import (
     AdapterTraining,
     PairDataModule,
@@ -37,6 +36,7 @@ from foundpose.training import (
     evaluate_scenes,
     summarize,
 )
+from foundpose.training.meshes import meshes_to_train_on, small_mesh
 
 # Settings that may change when a run is resumed; with more epochs in trainer it trains on.
 MAY_CHANGE = ("device", "representations", "trainer")
@@ -61,8 +61,8 @@ def run(cfg: DictConfig, output: Path) -> None:
     measurement after of the adapter that came out. Times are those of all parts of the run together.
     """
     held_out = load_mesh(cfg.held_out) if cfg.held_out is not None else small_mesh(cfg.held_out_seed)
-    meshes = wanted_meshes(cfg, "meshes", TRAINING_OBJECTS)
-    validation = wanted_meshes(cfg, "validation", VALIDATION_OBJECTS)
+    meshes = meshes_to_train_on(cfg.meshes, TRAINING_OBJECTS, "meshes")
+    validation = meshes_to_train_on(cfg.validation, VALIDATION_OBJECTS, "validation")
     if held_out.checksum in {mesh.checksum for mesh in (*meshes, *validation)}:
         raise ValueError(
             "the held-out object is among those trained on; give another held_out or held_out_seed"
@@ -101,23 +101,6 @@ def run(cfg: DictConfig, output: Path) -> None:
     print_table(results)
     print("seconds: " + ", ".join(f"{name} {value:.0f}" for name, value in clock.seconds.items()))
     print(f"adapter: {output / 'adapter.safetensors'}; in every app: --config-dir {output} extractor=adapted")
-
-
-def wanted_meshes(cfg: DictConfig, name: str, first: int) -> list[Mesh]:
-    """Meshes from files, or so many procedural ones."""
-    value = OmegaConf.to_container(cfg[name]) if OmegaConf.is_list(cfg[name]) else cfg[name]
-    if isinstance(value, list):
-        return [load_mesh(file) for file in value]
-    if not isinstance(value, int) or value < 0:
-        raise ValueError(
-            f"{name} must be a list of mesh files or a number of procedural objects, got {value!r}"
-        )
-    return [small_mesh(first + i) for i in range(value)]
-
-
-def small_mesh(seed: int) -> Mesh:
-    """A procedural object of 10 k vertices."""
-    return procedural_mesh(seed, subdivisions=5)
 
 
 def wanted_symmetries(cfg: DictConfig, name: str) -> Symmetries | None:

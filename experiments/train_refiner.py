@@ -25,7 +25,6 @@ from foundpose.io import write_atomically
 from foundpose.progress import ProgressBars
 from foundpose.refinement import RenderAndCompareRefiner, UpdateNetwork
 from foundpose.rendering import Mesh, load_mesh
-from foundpose.synthetic import procedural_mesh
 from foundpose.training import (
     RefinerDataModule,
     RefinerPictures,
@@ -35,6 +34,7 @@ from foundpose.training import (
     evaluate_refiner,
     summarize_refinement,
 )
+from foundpose.training.meshes import meshes_to_train_on, small_mesh
 
 # Settings that may change when a run is resumed; with more epochs in trainer it trains on.
 MAY_CHANGE = ("device", "representations", "trainer")
@@ -54,8 +54,8 @@ def main(cfg: DictConfig) -> None:
 def run(cfg: DictConfig, output: Path) -> None:
     """What :func:`main` does, in a folder; what is there already is not done again."""
     held_out = load_mesh(cfg.held_out) if cfg.held_out is not None else small_mesh(cfg.held_out_seed)
-    meshes = wanted_meshes(cfg, "meshes", TRAINING_OBJECTS)
-    validation = wanted_meshes(cfg, "validation", VALIDATION_OBJECTS)
+    meshes = meshes_to_train_on(cfg.meshes, TRAINING_OBJECTS, "meshes")
+    validation = meshes_to_train_on(cfg.validation, VALIDATION_OBJECTS, "validation")
     if held_out.checksum in {mesh.checksum for mesh in (*meshes, *validation)}:
         raise ValueError(
             "the held-out object is among those trained on; give another held_out or held_out_seed"
@@ -83,23 +83,6 @@ def run(cfg: DictConfig, output: Path) -> None:
     print("seconds: " + ", ".join(f"{name} {value:.0f}" for name, value in seconds.items()))
     print(f"network: {weights}")
     print(f"use it with: refiner=render_and_compare refiner.network.weights={weights}")
-
-
-def wanted_meshes(cfg: DictConfig, name: str, first: int) -> list[Mesh]:
-    """Meshes from files, or so many procedural ones."""
-    value = OmegaConf.to_container(cfg[name]) if OmegaConf.is_list(cfg[name]) else cfg[name]
-    if isinstance(value, list):
-        return [load_mesh(file) for file in value]
-    if not isinstance(value, int) or value < 0:
-        raise ValueError(
-            f"{name} must be a list of mesh files or a number of procedural objects, got {value!r}"
-        )
-    return [small_mesh(first + i) for i in range(value)]
-
-
-def small_mesh(seed: int) -> Mesh:
-    """A procedural object of 10 k vertices."""
-    return procedural_mesh(seed, subdivisions=5)
 
 
 def timed(seconds: dict[str, float], name: str, step: Callable[[], _T]) -> _T:

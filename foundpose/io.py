@@ -1,9 +1,16 @@
-"""Atomic file writing."""
+"""Files: atomic writing, and weights with a header that says what they are."""
 
+import json
 import os
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
 
 
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
@@ -29,3 +36,63 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def save_weights(path: Path, module: nn.Module, header: str, facts: dict[str, Any]) -> None:
+    """Write a module's state as one safetensors file, whole or not at all.
+
+    Args:
+        path: the file.
+        module: whose state dict is written.
+        header: name of the entry that tells what the file holds.
+        facts: goes into that entry, as JSON.
+    """
+    tensors = {name: value.detach().cpu().contiguous() for name, value in module.state_dict().items()}
+    metadata = {header: json.dumps(facts, sort_keys=True)}
+    write_atomically(path, lambda temporary: save_file(tensors, str(temporary), metadata=metadata))
+
+
+def read_weights(
+    path: Path, header: str, schema_version: int, what: str, hint: str
+) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Read what :func:`save_weights` wrote.
+
+    Args:
+        path: the file.
+        header: name of the entry that tells what the file holds.
+        schema_version: the version that its facts must have.
+        what: what is looked for, for messages.
+        hint: how to make such a file, for messages.
+
+    Returns:
+        The facts but for the version, and the tensors on the CPU.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: another kind of file, or of another schema version.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"no {what} at {path}; {hint}")
+    try:
+        with safe_open(str(path), framework="pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
+    except SafetensorError as error:
+        raise ValueError(f"{path} is not a readable safetensors file ({error})") from error
+    if header not in metadata:
+        raise ValueError(f"{path} holds no {what} (no {header!r} entry in its header)")
+    facts = json.loads(metadata[header])
+    version = facts.pop("schema_version", None)
+    if version != schema_version:
+        raise ValueError(f"{path} has schema version {version}, this library reads {schema_version}")
+    return facts, tensors
+
+
+def check_weights(path: Path, tensors: dict[str, Tensor], module: nn.Module) -> None:
+    """Raise ValueError unless tensors of a file have a module's names and shapes and are finite."""
+    expected = {name: tuple(value.shape) for name, value in module.state_dict().items()}
+    found = {name: tuple(value.shape) for name, value in tensors.items()}
+    if expected != found:
+        raise ValueError(f"{path} should hold the tensors {expected}, it holds {found}")
+    if not all(bool(torch.isfinite(value).all()) for value in tensors.values()):
+        raise ValueError(f"{path} holds weights that are not finite")

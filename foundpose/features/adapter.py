@@ -1,18 +1,15 @@
 """A small trained layer on the descriptors of an extractor."""
 
 import hashlib
-import json
 from pathlib import Path
 from typing import Self
 
 import torch
 import torch.nn.functional as F
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from foundpose.features.base import Fingerprint, PatchExtractor, PatchFeatures
-from foundpose.io import write_atomically
+from foundpose.io import check_weights, read_weights, save_weights
 
 SCHEMA_VERSION = 1
 _HEADER = "foundpose_adapter"
@@ -82,9 +79,7 @@ class ResidualAdapter(nn.Module):
     def save(self, path: str | Path) -> None:
         """Write settings and weights as one safetensors file, whole or not at all."""
         facts = {"schema_version": SCHEMA_VERSION, "channels": self.channels, "hidden": self.hidden}
-        tensors = {name: value.detach().cpu().contiguous() for name, value in self.state_dict().items()}
-        metadata = {_HEADER: json.dumps(facts, sort_keys=True)}
-        write_atomically(Path(path), lambda temporary: save_file(tensors, str(temporary), metadata=metadata))
+        save_weights(Path(path), self, _HEADER, facts)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -95,28 +90,10 @@ class ResidualAdapter(nn.Module):
             ValueError: no adapter's file, one of another schema version, or one whose weights are damaged.
         """
         path = Path(path)
-        if not path.is_file():
-            raise FileNotFoundError(f"no adapter at {path}; train one with experiments/train_adapter.py")
-        try:
-            with safe_open(str(path), framework="pt") as file:
-                metadata = file.metadata() or {}
-                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
-        except SafetensorError as error:
-            raise ValueError(f"{path} is not a readable safetensors file ({error})") from error
-        if _HEADER not in metadata:
-            raise ValueError(f"{path} holds no adapter (no {_HEADER!r} entry in its header)")
-        facts = json.loads(metadata[_HEADER])
-        if facts.get("schema_version") != SCHEMA_VERSION:
-            raise ValueError(
-                f"{path} has schema version {facts.get('schema_version')}, this library reads {SCHEMA_VERSION}"
-            )
+        hint = "train one with experiments/train_adapter.py"
+        facts, tensors = read_weights(path, _HEADER, SCHEMA_VERSION, "adapter", hint)
         adapter = cls(facts["channels"], facts["hidden"])
-        expected = {name: tuple(value.shape) for name, value in adapter.state_dict().items()}
-        found = {name: tuple(value.shape) for name, value in tensors.items()}
-        if expected != found:
-            raise ValueError(f"{path} should hold the tensors {expected}, it holds {found}")
-        if not all(bool(torch.isfinite(value).all()) for value in tensors.values()):
-            raise ValueError(f"{path} holds weights that are not finite")
+        check_weights(path, tensors, adapter)
         adapter.to(tensors["inner.weight"].dtype).load_state_dict(tensors)
         return adapter
 

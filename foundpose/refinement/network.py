@@ -1,15 +1,12 @@
 """A small network that sees crop and rendering and says how the pose should move."""
 
-import json
 from pathlib import Path
 
 import torch
 import torch.nn.functional as F
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from foundpose.io import write_atomically
+from foundpose.io import check_weights, read_weights, save_weights
 from foundpose.refinement.pose_update import IDENTITY_UPDATE, UPDATE_SIZE
 
 SCHEMA_VERSION = 1
@@ -153,10 +150,7 @@ class UpdateNetwork(nn.Module):
 
     def save(self, path: str | Path) -> None:
         """Write sizes and weights as one safetensors file, whole or not at all."""
-        tensors = {name: value.detach().cpu().contiguous() for name, value in self.state_dict().items()}
-        facts = {"schema_version": SCHEMA_VERSION, **self.settings}
-        metadata = {_HEADER: json.dumps(facts, sort_keys=True)}
-        write_atomically(Path(path), lambda temporary: save_file(tensors, str(temporary), metadata=metadata))
+        save_weights(Path(path), self, _HEADER, {"schema_version": SCHEMA_VERSION, **self.settings})
 
     def extra_repr(self) -> str:
         """Settings, for printing."""
@@ -213,28 +207,11 @@ def _layer(channels_in: int, channels_out: int, kernel: int, stride: int) -> nn.
 
 def _read(path: Path, network: UpdateNetwork) -> dict[str, Tensor]:
     """Weights of a file, checked against the network that they are for."""
-    if not path.is_file():
-        raise FileNotFoundError(f"no refiner network at {path}; train one with experiments/train_refiner.py")
-    try:
-        with safe_open(str(path), framework="pt") as file:
-            metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
-    except SafetensorError as error:
-        raise ValueError(f"{path} is not a readable safetensors file ({error})") from error
-    if _HEADER not in metadata:
-        raise ValueError(f"{path} holds no refiner network (no {_HEADER!r} entry in its header)")
-    facts = json.loads(metadata[_HEADER])
-    version = facts.pop("schema_version", None)
-    if version != SCHEMA_VERSION:
-        raise ValueError(f"{path} has schema version {version}, this library reads {SCHEMA_VERSION}")
+    hint = "train one with experiments/train_refiner.py"
+    facts, tensors = read_weights(path, _HEADER, SCHEMA_VERSION, "refiner network", hint)
     if facts != network.settings:
         raise ValueError(
             f"{path} holds a network with {facts}, the settings here are {network.settings}; use those of the file"
         )
-    expected = {name: tuple(value.shape) for name, value in network.state_dict().items()}
-    found = {name: tuple(value.shape) for name, value in tensors.items()}
-    if expected != found:
-        raise ValueError(f"{path} should hold the tensors {expected}, it holds {found}")
-    if not all(bool(torch.isfinite(value).all()) for value in tensors.values()):
-        raise ValueError(f"{path} holds weights that are not finite")
+    check_weights(path, tensors, network)
     return tensors

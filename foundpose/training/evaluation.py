@@ -99,7 +99,7 @@ def evaluate_scenes(
         told = FoundPose(
             pipeline.crop,
             pipeline.extractor,
-            given,  # type: ignore[arg-type]
+            given,  # type: ignore[arg-type]  # it stands in for a retriever
             pipeline.matcher,
             pipeline.pnp,
             pipeline.refiner,

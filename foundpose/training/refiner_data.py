@@ -315,7 +315,7 @@ class RendererPerMesh(Renderer):
         return self._copies[mesh.checksum](mesh, T_camera_from_model, K, size)
 
     def _render_views(self, *arguments: Any) -> None:
-        raise NotImplementedError("the copies render")
+        raise AssertionError("the copies render")
 
 
 def _transform(T: Tensor, points: Tensor) -> Tensor:
