@@ -8,7 +8,9 @@ from foundpose.bop import BopDataset, ground_truth_instances
 from foundpose.features import CoordinateCode, PatchNoise
 from foundpose.geometry import SuperFibonacci, project_to_rotation, rotation_angle
 from foundpose.onboarding import Onboarder
+from foundpose.optimization import BarronLoss
 from foundpose.pictures import TrueCoordinates
+from foundpose.refinement import FeaturemetricAlignment, FeaturemetricRefiner
 from foundpose.rendering import CoordinateRenderer, load_mesh
 from foundpose.retrieval import SoftAssignBow, VisualWords
 from tests.pose_errors import average_recalls, max_symmetric_errors
@@ -19,14 +21,17 @@ NUM_IMAGES = 10
 
 
 @pytest.mark.parametrize(
-    ("noise", "least_mspd", "least_mssd", "most_degrees"), [(0.0, 0.97, 0.85, 1.5), (0.3, 0.95, 0.8, 2.5)]
+    ("noise", "refine", "least_mspd", "least_mssd", "most_degrees"),
+    [(0.0, False, 0.97, 0.85, 1.5), (0.3, False, 0.95, 0.8, 2.5), (0.0, True, 0.99, 0.95, 0.35)],
 )
 def test_true_coordinates_on_real_poses(
-    lmo_root, representation, noise, least_mspd, least_mssd, most_degrees
+    lmo_root, representation, noise, refine, least_mspd, least_mssd, most_degrees
 ):
     dataset = BopDataset(lmo_root)
     pictures = TrueCoordinates()
-    pipeline = make_pipeline(PatchNoise(CoordinateCode(), noise))
+    alignment = FeaturemetricAlignment(BarronLoss(-5.0, 0.5), residual="norm")
+    refiner = FeaturemetricRefiner(alignment) if refine else None
+    pipeline = make_pipeline(PatchNoise(CoordinateCode(), noise), refiner=refiner)
     vertices = load_mesh(lmo_root / "models_eval" / f"obj_{OBJECT:06d}.ply").vertices.double().numpy()
     instances = [i for i in ground_truth_instances(dataset) if i.obj_id == OBJECT]
     errors, angles = [], []
