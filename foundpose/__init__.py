@@ -7,6 +7,7 @@ from foundpose.matching import PatchMatcher, SoftPatchMatcher
 from foundpose.onboarding import ObjectRepresentation, Onboarder, RepresentationStore
 from foundpose.pipeline import FoundPose
 from foundpose.pnp import GaussNewtonPnp, RansacPnp, SoftInlierSelection
+from foundpose.refinement import FeaturemetricRefiner, PoseRefiner, RefinerChain, RenderAndCompareRefiner
 from foundpose.rendering import Mesh, PyrenderRenderer, RaycastRenderer, load_mesh
 from foundpose.retrieval import SoftAssignBow, TemplateRetriever, VisualWords
 
@@ -16,6 +17,7 @@ __all__ = [
     "DenseSift",
     "DinoV2",
     "FeatureHook",
+    "FeaturemetricRefiner",
     "FoundPose",
     "GaussNewtonPnp",
     "Mesh",
@@ -26,10 +28,13 @@ __all__ = [
     "PcaProjection",
     "PerspectiveCrop",
     "PoseEstimates",
+    "PoseRefiner",
     "PoseStatus",
     "PyrenderRenderer",
     "RansacPnp",
     "RaycastRenderer",
+    "RefinerChain",
+    "RenderAndCompareRefiner",
     "RepresentationStore",
     "SoftAssignBow",
     "SoftInlierSelection",
