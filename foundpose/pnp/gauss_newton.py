@@ -118,7 +118,7 @@ class GaussNewtonPnp(nn.Module):
                 result.failed,
                 result.T.detach(),
                 result.H.detach(),
-                LocalFrame(*(part.detach() for part in frame)),
+                frame,
                 points_image.detach(),
                 points_model.detach(),
                 K.detach(),

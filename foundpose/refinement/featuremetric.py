@@ -186,7 +186,10 @@ class FeaturemetricAlignment(nn.Module):
         )
         seen = self._equations(result.T.detach(), points_local, problem, frame, unit, ceiling)
         improved = ~result.failed & (result.cost < result.initial_cost)
-        T_final = torch.where(improved[:, None, None], frame.pose_from_local(result.T), T)
+        T_aligned = frame.pose_from_local(result.T)
+        # A start that is the optimum already keeps its value to the bit, but has the optimum's gradient.
+        T_kept = torch.where(result.failed[:, None, None], T, T.detach() + (T_aligned - T_aligned.detach()))
+        T_final = torch.where(improved[:, None, None], T_aligned, T_kept)
         count = valid.sum(-1).clamp(min=1)
         most = ceiling.masked_fill(~valid, 0.0).sum(-1) / count
         # The equations have the half of the mean of ρ.

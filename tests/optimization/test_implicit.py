@@ -151,7 +151,10 @@ def test_gradient_of_the_losss_parameters() -> None:
 
         def evaluate(pose: Tensor) -> NormalEquations:
             values = {"alpha": alpha, "log_scale": log_scale}
-            call = lambda s: torch.func.functional_call(loss, values, (s,))  # noqa: E731 - a loss in one line
+
+            def call(squared: Tensor) -> tuple[Tensor, Tensor]:
+                return torch.func.functional_call(loss, values, (squared,))
+
             return robust_alignment(points_b, points_a, call)(pose)
 
         return optimise_pose(evaluate, T, max_iterations=100, tolerance=0.0).T[:, :3]

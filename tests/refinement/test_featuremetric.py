@@ -184,6 +184,21 @@ def test_implicit_and_unrolled_agree() -> None:
         torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-4 * float(b.abs().max()))
 
 
+def test_a_start_at_the_optimum_has_its_gradient() -> None:
+    problem, T = make_problem(2, points=30, noise=0.05)
+    settled = T
+    for _ in range(6):
+        settled = build(max_iterations=100, tolerance=0.0)(settled, problem).T_crop_from_model
+    leaf = problem.descriptors.clone().requires_grad_()
+    result = build()(settled, problem._replace(descriptors=leaf))
+    kept = result.cost >= result.initial_cost
+    assert kept.any()
+    assert torch.equal(result.T_crop_from_model[kept], settled[kept])
+    (gradient,) = torch.autograd.grad(pose_values(result.T_crop_from_model).square()[:, :, 3].sum(), leaf)
+    assert torch.isfinite(gradient).all()
+    assert (gradient[kept].abs().amax((1, 2)) > 0).all()
+
+
 def test_unrolled_gradient_of_the_start() -> None:
     problem, T = make_problem(1, points=30)
     module = build(differentiation="unrolled", interpolation="bicubic", max_iterations=2)
