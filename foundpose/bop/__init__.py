@@ -1,9 +1,21 @@
 """Files of the BOP benchmark: datasets, detections and results."""
 
-from foundpose.bop.dataset import Annotation, BopDataset, Target
-from foundpose.bop.files import BopError, read_image, read_mask
+from foundpose.bop.dataset import BopDataset
+from foundpose.bop.files import BopError, read_depth, read_image, read_mask
 from foundpose.bop.instances import Instance, decode_rle, detected_instances, ground_truth_instances
-from foundpose.bop.results import PoseResult, read_results, write_results
+from foundpose.bop.results import (
+    PoseResult,
+    best_of_targets,
+    check_times,
+    read_results,
+    result_file_name,
+    share_image_times,
+    write_results,
+)
+from foundpose.bop.scenes import Annotation
+from foundpose.bop.scores import Scores
+from foundpose.bop.scoring import check_functions, score_results
+from foundpose.bop.targets import Target
 
 __all__ = [
     "Annotation",
@@ -11,12 +23,20 @@ __all__ = [
     "BopError",
     "Instance",
     "PoseResult",
+    "Scores",
     "Target",
+    "best_of_targets",
+    "check_functions",
+    "check_times",
     "decode_rle",
     "detected_instances",
     "ground_truth_instances",
+    "read_depth",
     "read_image",
     "read_mask",
     "read_results",
+    "result_file_name",
+    "score_results",
+    "share_image_times",
     "write_results",
 ]

@@ -1,0 +1,136 @@
+"""Targets, annotations and estimates of an evaluation as padded tables."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
+
+from foundpose.bop.dataset import BopDataset
+from foundpose.bop.files import BopError
+from foundpose.bop.matching import best_first, most_visible
+from foundpose.bop.results import PoseResult
+from foundpose.bop.targets import Target
+
+
+@dataclass(frozen=True)
+class Localization:
+    """N targets with the estimates that count and the annotations to be found, in the order that matching wants.
+
+    Attributes:
+        images: I pairs (scene, image), ascending.
+        image: (N,) index into ``images``.
+        object_ids: O ids, ascending.
+        object: (N,) index into ``object_ids``.
+        inst_count: (N,) instances that each target asks for.
+        estimates: (N, n) index into ``T_est``, best first; −1 is padding.
+        annotations: (N, g) index into ``T_true``; −1 is padding.
+        T_est: (R, 4, 4) float64, poses of all results.
+        T_true: (A, 4, 4) float64, true poses.
+        outside: number of results that belong to no target.
+    """
+
+    images: list[tuple[int, int]]
+    image: Tensor
+    object_ids: list[int]
+    object: Tensor
+    inst_count: Tensor
+    estimates: Tensor
+    annotations: Tensor
+    T_est: Tensor
+    T_true: Tensor
+    outside: int
+
+    def pairs(self) -> Tensor:
+        """(P, 3) target, place of the estimate, place of the annotation: all errors that are needed."""
+        return ((self.estimates >= 0)[:, :, None] & (self.annotations >= 0)[:, None]).nonzero()
+
+
+def localization(
+    dataset: BopDataset, results: Sequence[PoseResult], targets: Sequence[Target] | None = None
+) -> Localization:
+    """Sort estimates and ground truth by target, by the rules of BOP'19; all targets of the dataset by default.
+
+    Counted are, for each target, the ``inst_count`` estimates of highest score; to be found are the ``inst_count``
+    most visible annotations (one of unknown visibility counts as fully visible). Of equal ones the first in the order
+    given come first.
+
+    Raises:
+        BopError: the split has no ground truth, or no targets.
+    """
+    asked = dataset.targets() if targets is None else list(targets)
+    for scene_id in sorted({target.scene_id for target in asked}):
+        if not dataset.has_ground_truth(scene_id):
+            raise BopError(
+                f"scene {scene_id} of {dataset.split} has no ground truth (scene_gt.json), so recall cannot be "
+                "computed here; results on a test set without it are scored on the benchmark's site"
+            )
+    targets = dataset.localization_targets(asked)
+    if not targets:
+        raise BopError(
+            f"there is nothing to localise: no targets (those of the dataset: {dataset.targets_path})"
+        )
+    keys = [(t.scene_id, t.im_id, t.obj_id) for t in targets]
+    number = {key: n for n, key in enumerate(keys)}
+    images = sorted({key[:2] for key in keys})
+    image_number = {image: i for i, image in enumerate(images)}
+    object_ids = sorted({obj_id for *_, obj_id in keys if obj_id is not None})
+    inst_count = torch.tensor([t.inst_count for t in targets])
+
+    result_lists: list[list[int]] = [[] for _ in targets]
+    outside = 0
+    for index, result in enumerate(results):
+        n = number.get((result.scene_id, result.im_id, result.obj_id))
+        if n is None:
+            outside += 1
+        else:
+            result_lists[n].append(index)
+    scores = torch.tensor([result.score for result in results], dtype=torch.float64)
+    listed = _padded(result_lists)
+    ranking = best_first(_lookup(scores, listed), listed >= 0, inst_count)
+    estimates = torch.where(ranking.counted, listed.gather(1, ranking.order), -1)
+
+    truth_lists: list[list[int]] = [[] for _ in targets]
+    poses: list[Tensor] = []
+    visibility: list[float] = []
+    for scene_id, im_id in images:
+        for annotation in dataset.annotations(scene_id, im_id):
+            n = number.get((scene_id, im_id, annotation.obj_id))
+            if n is not None:
+                truth_lists[n].append(len(poses))
+                poses.append(annotation.T_camera_from_model)
+                visible = annotation.visible_fraction
+                visibility.append(1.0 if visible is None else visible)
+    annotated = _padded(truth_lists)
+    shares = _lookup(torch.tensor(visibility, dtype=torch.float64), annotated)
+    wanted = torch.where(most_visible(shares, annotated >= 0, inst_count), annotated, -1)
+    # Sorted stably by being padding: keeps the order, and drops what need not be found.
+    wanted = wanted.gather(1, (wanted < 0).byte().sort(dim=1, stable=True).indices)
+    most = int(inst_count.max())
+    return Localization(
+        images=images,
+        image=torch.tensor([image_number[key[:2]] for key in keys]),
+        object_ids=object_ids,
+        object=torch.tensor([object_ids.index(obj_id) for *_, obj_id in keys if obj_id is not None]),
+        inst_count=inst_count,
+        estimates=estimates[:, :most],
+        annotations=wanted[:, :most],
+        T_est=_stacked([result.T_camera_from_model for result in results]),
+        T_true=_stacked(poses),
+        outside=outside,
+    )
+
+
+def _padded(lists: list[list[int]]) -> Tensor:
+    rows = [torch.tensor(row, dtype=torch.int64) for row in lists]
+    return pad_sequence(rows, batch_first=True, padding_value=-1)
+
+
+def _lookup(values: Tensor, index: Tensor) -> Tensor:
+    """Values (R,) at an index (N, n); 0 where it is −1."""
+    return torch.cat([values, values.new_zeros(1)])[index]
+
+
+def _stacked(poses: list[Tensor]) -> Tensor:
+    return torch.stack(poses).to(torch.float64) if poses else torch.zeros(0, 4, 4, dtype=torch.float64)
