@@ -19,14 +19,23 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 from tqdm import tqdm
 
-from foundpose.bop import BopDataset, Instance, PoseResult, read_image, read_mask, write_results
+from foundpose.bop import (
+    BopDataset,
+    Instance,
+    read_image,
+    read_mask,
+    result_file_name,
+    write_results,
+)
 from foundpose.config import Method, build_method, claim_run_folder, clear_errors, wanted_objects
-from foundpose.estimates import PoseEstimates, PoseStatus
+from foundpose.estimates import PoseEstimates
 from foundpose.geometry import boxes_from_xywh, intrinsics_matrix, masks_from_boxes
-from foundpose.io import write_atomically
+from foundpose.io import write_json
+from foundpose.objects import DatasetObjects
 from foundpose.onboarding import ObjectRepresentation
 from foundpose.progress import ProgressBars
-from foundpose.rendering import Mesh, load_mesh
+from foundpose.records import add_image_times, best_results, instance_record, pose_records, to_results
+from foundpose.rendering import Mesh, Renderer, load_mesh
 from foundpose.timing import StageTimer
 from foundpose.visualization import save_estimate_figure
 
@@ -76,7 +85,7 @@ def estimate_picture(cfg: DictConfig, output: Path) -> None:
     index = torch.zeros(1, dtype=torch.int64)
     shown = [(mesh, representation)]
     estimates, seconds = run_pipeline(method, cfg.device, image, K, mask[None], shown, index)
-    facts = describe(estimates, 0) | {"mesh": str(cfg.mesh), "image": str(cfg.image), "time": seconds}
+    facts = pose_records(estimates)[0] | {"mesh": str(cfg.mesh), "image": str(cfg.image), "time": seconds}
     write_json(output / "estimate.json", facts)
     write_results(output / "results.csv", to_results([facts | {"scene_id": 0, "im_id": 0, "obj_id": 0}]))
     save_estimate_figure(
@@ -124,16 +133,8 @@ def estimate_dataset(cfg: DictConfig, output: Path) -> None:
 
     method = build_method(cfg)
     pictures = instantiate(cfg.pictures)
-    objects: dict[int, tuple[Mesh, ObjectRepresentation]] = {}
-    for obj_id in sorted({i.obj_id for key in images for i in by_image[key]}):
-        mesh = load_mesh(dataset.mesh_path(obj_id))
-        if not 0.5 < mesh.diameter / dataset.diameter(obj_id) < 2.0:
-            raise ValueError(
-                f"{dataset.mesh_path(obj_id)} has a diameter of {mesh.diameter:.4g}, models_info.json says "
-                f"{dataset.diameter(obj_id):.4g}: are they in the same unit?"
-            )
-        name = f"{dataset.root.name}-{obj_id:06d}"
-        objects[obj_id] = (mesh, method.store.get(mesh, name, ProgressBars(name)).to(cfg.device))
+    objects = DatasetObjects(dataset, method.store)
+    objects.onboard(sorted({i.obj_id for key in images for i in by_image[key]}), ProgressBars)
 
     entries: list[dict[str, Any]] = []
     for position, (scene_id, im_id) in enumerate(tqdm(images, desc="images")):
@@ -145,26 +146,33 @@ def estimate_dataset(cfg: DictConfig, output: Path) -> None:
             masks = torch.stack([instance.mask(dataset) for instance in members])
             ids = sorted({instance.obj_id for instance in members})
             index = torch.tensor([ids.index(instance.obj_id) for instance in members])
-            shown = [objects[i] for i in ids]
+            representations = objects.representations(ids, cfg.device)
+            shown = list(zip(map(objects.mesh, ids), representations, strict=True))
             estimates, seconds = run_pipeline(method, cfg.device, image, K, masks, shown, index)
-            seconds += max(instance.time for instance in members)
             if cfg.overlays and position % cfg.overlays == 0:
-                save_overlays(output / "overlays", dataset, members, K, estimates, objects, method)
+                renderer = method.onboarder.renderer
+                save_overlays(
+                    output / "overlays",
+                    dataset,
+                    members,
+                    K,
+                    estimates,
+                    dict(zip(ids, shown, strict=True)),
+                    renderer,
+                )
             write_json(
                 path,
                 [
-                    {"scene_id": scene_id, "im_id": im_id, "obj_id": instance.obj_id, "time": seconds}
-                    | {"detection_score": instance.score}
-                    | describe(estimates, i)
-                    for i, instance in enumerate(members)
+                    instance_record(instance) | pose | {"seconds": seconds / len(members)}
+                    for instance, pose in zip(members, pose_records(estimates), strict=True)
                 ],
             )
         entries += json.loads(path.read_text())
 
+    add_image_times(entries)
     write_json(output / "estimates.json", entries)
-    csv = output / f"{cfg.method.replace('_', '-')}_{dataset.root.name}-{Path(cfg.data.split).name}.csv"
-    counts = {target[:3]: target.inst_count for target in dataset.targets()}
-    write_results(csv, to_results(best_of_targets(entries, counts)))
+    csv = output / result_file_name(cfg.method, dataset.root.name, cfg.data.split)
+    write_results(csv, best_results(to_results(entries), dataset.targets()))
     valid = sum(entry["valid"] for entry in entries)
     print(f"{len(entries)} instances in {len(images)} images, {valid} with a pose; written to {csv}")
 
@@ -192,52 +200,6 @@ def run_pipeline(
     return estimates, timer.seconds["pipeline"]
 
 
-def describe(estimates: PoseEstimates, index: int) -> dict[str, Any]:
-    """What is written of one estimate."""
-    T = estimates.T_camera_from_model[index].double().cpu()
-    return {
-        "valid": bool(estimates.valid[index]),
-        "status": PoseStatus(int(estimates.status[index])).name,
-        "score": float(estimates.score[index]),
-        "num_inliers": int(estimates.num_inliers[index]),
-        "num_patches": int(estimates.query.valid[index].sum()),
-        "R": T[:3, :3].tolist(),
-        "t": T[:3, 3].tolist(),
-        "templates": estimates.templates.index[index].tolist(),
-        "similarities": estimates.templates.similarity[index].nan_to_num(neginf=-1.0).tolist(),
-        "best": int(estimates.best[index]),
-    }
-
-
-def best_of_targets(
-    entries: list[dict[str, Any]], counts: dict[tuple[int, int, int], int]
-) -> list[dict[str, Any]]:
-    """As many entries of each target as it has instances, those with the best scores, in the order they came."""
-    ranks: dict[tuple[int, int, int], list[int]] = defaultdict(list)
-    for i, entry in enumerate(entries):
-        if entry["valid"]:
-            ranks[entry["scene_id"], entry["im_id"], entry["obj_id"]].append(i)
-    kept = {
-        i
-        for target, found in ranks.items()
-        for i in sorted(found, key=lambda i: -entries[i]["score"])[: counts.get(target, len(found))]
-    }
-    return [entry for i, entry in enumerate(entries) if i in kept]
-
-
-def to_results(entries: list[dict[str, Any]]) -> list[PoseResult]:
-    """Lines of the BOP file; estimates that failed are left out."""
-    results = []
-    for entry in entries:
-        if entry["valid"]:
-            T = torch.eye(4, dtype=torch.float64)
-            T[:3, :3] = torch.tensor(entry["R"], dtype=torch.float64)
-            T[:3, 3] = torch.tensor(entry["t"], dtype=torch.float64)
-            ids = (entry["scene_id"], entry["im_id"], entry["obj_id"])
-            results.append(PoseResult(*ids, entry["score"], T, entry["time"]))
-    return results
-
-
 def save_overlays(
     folder: Path,
     dataset: BopDataset,
@@ -245,21 +207,14 @@ def save_overlays(
     K: Tensor,
     estimates: PoseEstimates,
     objects: dict[int, tuple[Mesh, ObjectRepresentation]],
-    method: Method,
+    renderer: Renderer,
 ) -> None:
     """One figure per instance of an image."""
     photograph = dataset.image(members[0].scene_id, members[0].im_id)
     for i, instance in enumerate(members):
         mesh, representation = objects[instance.obj_id]
         name = f"{instance.scene_id:06d}_{instance.im_id:06d}_{instance.obj_id:06d}_{i}.png"
-        save_estimate_figure(
-            folder / name, photograph, K, estimates, i, representation, mesh, method.onboarder.renderer
-        )
-
-
-def write_json(path: Path, content: Any) -> None:
-    """Write JSON atomically."""
-    write_atomically(path, lambda temporary: temporary.write_text(json.dumps(content, indent=1)))
+        save_estimate_figure(folder / name, photograph, K, estimates, i, representation, mesh, renderer)
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from hydra.errors import InstantiationException
@@ -82,14 +82,20 @@ def claim_run_folder(folder: Path, cfg: DictConfig, ignore: tuple[str, ...]) -> 
     Args:
         folder: the run's folder.
         cfg: the settings.
-        ignore: top-level keys that may change between the parts of a run.
+        ignore: keys that may change between the parts of a run, as ``trainer`` or ``data_module.num_workers``.
 
     Raises:
         ValueError: the folder belongs to a run with other settings; the message shows the difference.
     """
     settings = OmegaConf.to_container(cfg, resolve=True)
     assert isinstance(settings, dict)
-    text = json.dumps({k: v for k, v in settings.items() if k not in ignore}, indent=1, sort_keys=True)
+    for key in ignore:
+        *parents, last = key.split(".")
+        node: Any = settings
+        for parent in parents:
+            node = node.get(parent, {})
+        node.pop(last, None)
+    text = json.dumps(settings, indent=1, sort_keys=True)
     path = folder / "settings.json"
     if path.is_file():
         before = path.read_text()

@@ -38,6 +38,11 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
         temporary.unlink(missing_ok=True)
 
 
+def write_json(path: Path, content: Any) -> None:
+    """Write JSON, whole or not at all."""
+    write_atomically(path, lambda temporary: temporary.write_text(json.dumps(content, indent=1)))
+
+
 def save_weights(path: Path, module: nn.Module, header: str, facts: dict[str, Any]) -> None:
     """Write a module's state as one safetensors file, whole or not at all.
 

@@ -6,6 +6,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import get_class, instantiate
 from omegaconf import OmegaConf
+from pytorch_lightning.strategies import DDPStrategy
 
 from foundpose.bop import BopDataset
 from foundpose.config import build_method, claim_run_folder
@@ -40,6 +41,10 @@ def load(name="config", *overrides):
 def test_every_option_is_instantiated(group, option, tiny_bop, monkeypatch):
     if group == "loss":  # of a training, not of the method
         assert instantiate(load("train_adapter", f"loss={option}").loss) is not None
+        return
+    if group == "trainer":  # of an evaluation
+        trainer = instantiate(load("evaluate", f"trainer={option}", "trainer.accelerator=cpu").trainer)
+        assert isinstance(trainer.strategy, DDPStrategy) == (option == "ddp")
         return
     overrides = [f"{group}={option}"]
     if group == "extractor" and option.startswith("dinov2") and option != "dinov2_random":
@@ -142,5 +147,28 @@ def test_a_run_folder_keeps_to_its_settings(tmp_path):
     cfg = OmegaConf.create({"a": 1, "device": "cpu"})
     claim_run_folder(tmp_path, cfg, ignore=("device",))
     claim_run_folder(tmp_path, OmegaConf.create({"a": 1, "device": "cuda"}), ignore=("device",))
+    claim_run_folder(tmp_path, OmegaConf.create({"a": 1}), ignore=("device",))
     with pytest.raises(ValueError, match=r'(?s)other settings.*-  "a": 1.*\+  "a": 2'):
         claim_run_folder(tmp_path, OmegaConf.create({"a": 2, "device": "cpu"}), ignore=("device",))
+
+
+def test_keys_inside_a_node_may_change_too(tmp_path):
+    def settings(size, workers):
+        return OmegaConf.create({"data": {"size": size, "workers": workers}})
+
+    ignore = ("data.workers", "trainer.devices")
+    claim_run_folder(tmp_path, settings(1, 0), ignore)
+    claim_run_folder(tmp_path, settings(1, 4), ignore)
+    with pytest.raises(ValueError, match="other settings"):
+        claim_run_folder(tmp_path, settings(2, 0), ignore)
+
+
+def test_evaluation_takes_what_its_config_says():
+    cfg = load("evaluate")
+    for node, runtime in (
+        (cfg.data_module, {"dataset", "masks", "objects", "folder", "pictures", "object_ids", "max_images"}),
+        (cfg.evaluation, {"pipeline", "objects", "folder"}),
+    ):
+        parameters = dict(inspect.signature(get_class(node._target_).__init__).parameters)
+        assert set(parameters) - {"self"} == runtime | {k for k in node if not k.startswith("_")}
+        assert all(parameters[k].default == node[k] for k in node if not k.startswith("_"))

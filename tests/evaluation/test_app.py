@@ -1,0 +1,209 @@
+import csv
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from foundpose.bop import check_times, read_results
+from foundpose.evaluation.shards import shard_path
+from tests.bop_dataset import make_bop_dataset
+from tests.test_experiments import SMALL, run_app
+
+ROOT = Path(__file__).resolve().parents[2]
+NUM_IMAGES = 6
+NAME = "oracle_tiny-test.csv"
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    return make_bop_dataset(tmp_path_factory.mktemp("evaluation") / "tiny", images=NUM_IMAGES)
+
+
+@pytest.fixture(scope="module")
+def representations(tmp_path_factory):
+    return tmp_path_factory.mktemp("representations")
+
+
+@pytest.fixture(scope="module")
+def arguments(root, representations):
+    return [
+        "experiment=oracle",
+        f"data.root={root}",
+        *SMALL,
+        f"representations={representations}",
+        "trainer.accelerator=cpu",
+        "data_module.batch_size=2",
+    ]
+
+
+@pytest.fixture(scope="module")
+def reference(arguments, tmp_path_factory):
+    """A run left alone, of one process."""
+    folder = tmp_path_factory.mktemp("reference")
+    start(arguments, folder).check_returncode()
+    return folder
+
+
+def command(arguments, folder):
+    return [
+        sys.executable,
+        str(ROOT / "experiments" / "evaluate.py"),
+        *arguments,
+        f"hydra.run.dir={folder}",
+    ]
+
+
+ENVIRONMENT = os.environ | {"OMP_NUM_THREADS": "1"}
+
+
+def start(arguments, folder):
+    return subprocess.run(
+        command(arguments, folder), env=ENVIRONMENT, capture_output=True, text=True, timeout=300
+    )
+
+
+def rows_without_times(path):
+    return [line.split(",")[:-1] for line in path.read_text().splitlines()]
+
+
+def test_a_run_from_detections_to_scores(reference):
+    results = read_results(reference / NAME)
+    check_times(results)
+    assert [(r.scene_id, r.im_id, r.obj_id) for r in results] == [
+        (1, i, 1 + i % 2) for i in range(NUM_IMAGES)
+    ]
+    assert all(result.time > 0.25 for result in results)
+    scores = json.loads((reference / "scores.json").read_text())
+    assert scores["targets"] == NUM_IMAGES
+    assert scores["mspd"]["AR"] > 0.9
+    assert scores["mssd"]["AR"] > 0.9
+    assert len(scores["mspd"]["recalls"]) == 10
+    assert set(scores["mspd"]["objects"]) == {"1", "2"}
+    timing = json.loads((reference / "timing.json").read_text())
+    assert timing["instances"] == NUM_IMAGES
+    assert timing["seconds"]["pnp"] > 0
+    records = json.loads((reference / "estimates.json").read_text())
+    assert [r["detection_score"] for r in records] == [0.9] * NUM_IMAGES
+
+
+def test_two_processes_share_the_work(arguments, reference, tmp_path):
+    """No instance is lost or done twice, and the results are those of one process."""
+    run = start([*arguments, "trainer=ddp", "trainer.devices=2"], tmp_path)
+    assert run.returncode == 0, run.stderr[-2000:]
+    shares = []
+    for rank in range(2):
+        lines = shard_path(tmp_path, rank).read_text().splitlines()
+        shares.append([json.loads(line)["number"] for line in lines])
+    assert shares == [[0, 2], [1]]
+    assert rows_without_times(tmp_path / NAME) == rows_without_times(reference / NAME)
+    # One process wrote the results and printed the table.
+    assert run.stdout.count("AR_MSPD") == 1
+    scores = [json.loads((folder / "scores.json").read_text()) for folder in (tmp_path, reference)]
+    assert scores[0]["mspd"] == scores[1]["mspd"]
+
+
+def test_a_killed_run_goes_on(arguments, reference, root, tmp_path):
+    """Kill it as soon as batches are there, twice; the end is that of the run left alone."""
+    shard = shard_path(tmp_path, 0)
+    for batches in (1, 2):
+        process = subprocess.Popen(command(arguments, tmp_path), env=ENVIRONMENT, stderr=subprocess.DEVNULL)
+        deadline = time.monotonic() + 120
+        while not shard.is_file() or shard.read_bytes().count(b"\n") < batches:
+            assert process.poll() is None, "the run ended before it could be killed"
+            assert time.monotonic() < deadline
+            time.sleep(0.002)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        assert not (tmp_path / NAME).exists()
+    # A line that the kill cut short.
+    shard.write_bytes(shard.read_bytes() + b'{"number": 2, "rec')
+    before = shard.read_bytes().splitlines()[:2]
+    # The rest may be done by more processes.
+    run = start([*arguments, "trainer=ddp", "trainer.devices=2"], tmp_path)
+    assert run.returncode == 0, run.stderr[-2000:]
+    assert shard.read_bytes().splitlines()[:2] == before
+    assert rows_without_times(tmp_path / NAME) == rows_without_times(reference / NAME)
+
+
+def test_more_masks_than_instances(arguments, reference, tmp_path, monkeypatch, capsys):
+    """Five masks for each instance, of which the best pose is handed in."""
+    run_app(monkeypatch, "evaluate", *arguments, "masks.masks_per_instance=5", f"hydra.run.dir={tmp_path}")
+    assert len(json.loads((tmp_path / "estimates.json").read_text())) == 2 * NUM_IMAGES
+    assert len(read_results(tmp_path / NAME)) == NUM_IMAGES
+    assert json.loads((tmp_path / "scores.json").read_text())["mspd"]["AR"] > 0.9
+    assert "AR_MSPD" in capsys.readouterr().out
+
+
+def test_a_part_is_scored_on_its_own_targets(arguments, tmp_path, monkeypatch):
+    run_app(monkeypatch, "evaluate", *arguments, "objects=[2]", "max_images=4", f"hydra.run.dir={tmp_path}")
+    scores = json.loads((tmp_path / "scores.json").read_text())
+    assert scores["targets"] == len(read_results(tmp_path / NAME)) == 2
+    assert scores["mspd"]["AR"] > 0.9
+
+
+def test_scores_of_a_results_file(arguments, reference, tmp_path, monkeypatch, capsys):
+    path = tmp_path / "submission_tiny-test.csv"
+    with (reference / NAME).open(newline="") as file:
+        rows = list(csv.reader(file))
+    with path.open("w", newline="") as file:
+        csv.writer(file).writerows(rows[:-3])
+    run_app(monkeypatch, "evaluate", *arguments, f"results={path}", f"hydra.run.dir={tmp_path / 'run'}")
+    scores = json.loads((tmp_path / "run" / "scores.json").read_text())
+    whole = json.loads((reference / "scores.json").read_text())
+    assert scores["target_instances_without_estimate"] == 3
+    assert scores["mspd"]["AR"] == pytest.approx(whole["mspd"]["AR"] / 2, abs=0.05)
+    assert not (tmp_path / "run" / "shards").exists()
+    assert "AR_MSSD" in capsys.readouterr().out
+
+
+def test_a_test_set_without_ground_truth(arguments, root, reference, tmp_path, monkeypatch, capsys):
+    copy = shutil.copytree(root, tmp_path / "tiny")
+    for path in copy.glob("test/*/scene_gt*.json"):
+        path.unlink()
+    output = tmp_path / "run"
+    run_app(
+        monkeypatch,
+        "evaluate",
+        *arguments,
+        f"data.root={copy}",
+        "pictures=photographs",
+        f"hydra.run.dir={output}",
+    )
+    assert "no scores: 1 of 1 scenes" in capsys.readouterr().out
+    scores = json.loads((output / "scores.json").read_text())
+    assert scores["computed"] is False
+    assert "scene_gt.json" in scores["reason"]
+    assert (output / NAME).is_file()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (["results=none.csv"], "no results file at none.csv"),
+        (["data_module.batch_size=0"], "batch_size must be at least 1, got 0"),
+        (["errors=[mssd,iou]"], "iou"),
+        (["masks.path=nowhere"], "nowhere"),
+        (["objects=[9]"], "objects must be a list of ids from [1, 2]"),
+        (["memory_limit=0.01"], "memory_limit is 0.01"),
+        (["max_images=0"], "nothing to estimate"),
+        (["pnp.iterations=50"], "holds a run with other settings"),
+    ],
+)
+def test_bad_input_is_one_clear_line(arguments, reference, tmp_path, monkeypatch, capsys, change, message):
+    output = tmp_path
+    if change[0].startswith("pnp"):
+        shutil.copy(reference / "settings.json", tmp_path)
+    before = sorted(output.iterdir())
+    with pytest.raises(SystemExit) as stop:
+        run_app(monkeypatch, "evaluate", *arguments, *change, f"hydra.run.dir={output}")
+    assert stop.value.code == 2
+    error = capsys.readouterr().err.strip().splitlines()
+    assert message in "\n".join(error[-40:])
+    assert not (output / NAME).exists()
+    assert set(before) <= set(output.iterdir())
