@@ -4,6 +4,7 @@ python experiments/evaluate.py data=lmo data.root=/path/to/lmo masks=cnos
 python experiments/evaluate.py data=lmo data.root=/path/to/lmo results=submission_lmo-test.csv
 """
 
+import logging
 import warnings
 from pathlib import Path
 
@@ -71,6 +72,7 @@ def evaluate(cfg: DictConfig, dataset: BopDataset, wanted: list[int], output: Pa
         max_images=cfg.max_images,
     )
     batches = data.batches
+    logging.getLogger("pytorch_lightning.utilities.rank_zero").setLevel(logging.WARNING)
     claim_run_folder(output, cfg, MAY_CHANGE)
     trainer: pl.Trainer = instantiate(cfg.trainer, default_root_dir=output)
     module: PoseEvaluation = instantiate(
@@ -79,6 +81,7 @@ def evaluate(cfg: DictConfig, dataset: BopDataset, wanted: list[int], output: Pa
     with warnings.catch_warnings():
         # Reading is a small part of the time; num_workers is there for those who want it.
         warnings.filterwarnings("ignore", message=".*does not have many workers.*")
+        warnings.filterwarnings("ignore", message=".*LeafSpec.*")  # Lightning's own
         estimate_dataset(trainer, module, data)
     if not trainer.is_global_zero:
         return
