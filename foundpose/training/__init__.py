@@ -1,6 +1,6 @@
 """What training through the pipeline needs: rendered views, pairs, Lightning modules and a measure of success.
 
-Imports pytorch_lightning; nothing else in the library does.
+Imports pytorch_lightning, as only ``foundpose.evaluation`` does besides.
 """
 
 from foundpose.training.adapter import AdapterTraining, PairLoss, PairPoses

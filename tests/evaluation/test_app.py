@@ -182,6 +182,21 @@ def test_a_test_set_without_ground_truth(arguments, root, reference, tmp_path, m
     assert (output / NAME).is_file()
 
 
+def test_targets_that_name_images_only(arguments, root, reference, tmp_path, monkeypatch):
+    """bop24: every detection of an image is estimated; what there is to find follows from the ground truth."""
+    copy = shutil.copytree(root, tmp_path / "tiny")
+    targets = [{"scene_id": 1, "im_id": i} for i in range(NUM_IMAGES)]
+    (copy / "test_targets_bop24.json").write_text(json.dumps(targets))
+    output = tmp_path / "run"
+    changes = [f"data.root={copy}", "data.targets=test_targets_bop24.json", f"hydra.run.dir={output}"]
+    run_app(monkeypatch, "evaluate", *arguments, *changes)
+    assert len(json.loads((output / "estimates.json").read_text())) == 2 * NUM_IMAGES
+    scores = json.loads((output / "scores.json").read_text())
+    assert scores["targets"] == NUM_IMAGES
+    assert "6D detection" in scores["task"]
+    assert scores["mspd"]["AR"] == json.loads((reference / "scores.json").read_text())["mspd"]["AR"]
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
