@@ -3,7 +3,6 @@ import json
 import pytest
 from PIL import Image
 
-from experiments.estimate import best_of_targets
 from tests.test_experiments import SMALL, run_app
 
 
@@ -47,14 +46,3 @@ def test_convergence_needs_a_refiner(tiny_bop, monkeypatch, tmp_path, capsys):
         )
     assert stop.value.code == 2
     assert "set refiner=featuremetric" in capsys.readouterr().err
-
-
-def test_the_best_estimates_of_a_target_are_kept():
-    def entry(obj_id, score, valid=True):
-        return {"scene_id": 1, "im_id": 2, "obj_id": obj_id, "score": score, "valid": valid}
-
-    entries = [entry(1, 0.2), entry(1, 0.9), entry(2, 0.1), entry(1, 0.5), entry(1, 1.0, valid=False)]
-    kept = best_of_targets(entries, {(1, 2, 1): 2, (1, 2, 2): 1})
-    assert [(e["obj_id"], e["score"]) for e in kept] == [(1, 0.9), (2, 0.1), (1, 0.5)]
-    # An object that is no target keeps what it has.
-    assert len(best_of_targets(entries, {})) == 4
