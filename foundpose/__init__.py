@@ -6,14 +6,21 @@ from foundpose.geometry import PerspectiveCrop, SphereInplane, SuperFibonacci
 from foundpose.matching import PatchMatcher, SoftPatchMatcher
 from foundpose.onboarding import ObjectRepresentation, Onboarder, RepresentationStore
 from foundpose.pipeline import FoundPose
-from foundpose.pnp import GaussNewtonPnp, RansacPnp, SoftInlierSelection
+from foundpose.pnp import GaussNewtonPnp, RansacPnp, SoftInlierSelection, TopTemplatePose
 from foundpose.refinement import FeaturemetricRefiner, PoseRefiner, RefinerChain, RenderAndCompareRefiner
 from foundpose.rendering import Mesh, PyrenderRenderer, RaycastRenderer, load_mesh
-from foundpose.retrieval import SoftAssignBow, TemplateRetriever, VisualWords
+from foundpose.retrieval import (
+    ClsRetriever,
+    PatchVoteRetriever,
+    SoftAssignBow,
+    TemplateRetriever,
+    VisualWords,
+)
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "ClsRetriever",
     "DenseSift",
     "DinoV2",
     "FeatureHook",
@@ -25,6 +32,7 @@ __all__ = [
     "Onboarder",
     "PatchExtractor",
     "PatchMatcher",
+    "PatchVoteRetriever",
     "PcaProjection",
     "PerspectiveCrop",
     "PoseEstimates",
@@ -42,6 +50,7 @@ __all__ = [
     "SphereInplane",
     "SuperFibonacci",
     "TemplateRetriever",
+    "TopTemplatePose",
     "VisualWords",
     "load_mesh",
 ]

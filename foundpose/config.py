@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from foundpose.bop import BopDataset
 from foundpose.features import PatchExtractor
 from foundpose.io import write_atomically
-from foundpose.onboarding import Onboarder, RepresentationStore
+from foundpose.onboarding import ArtefactStore, Onboarder, RepresentationStore
 from foundpose.pipeline import FoundPose
 from foundpose.rendering import RendererNotAvailableError
 
@@ -56,7 +56,11 @@ def build_method(cfg: DictConfig) -> Method:
     return Method(
         onboarder.to(device).eval(),
         pipeline.to(device).eval(),
-        RepresentationStore(cfg.representations, onboarder),
+        RepresentationStore(
+            cfg.representations,
+            onboarder,
+            None if cfg.get("artefacts") is None else ArtefactStore(cfg.artefacts),
+        ),
     )
 
 

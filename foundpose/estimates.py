@@ -3,10 +3,11 @@
 from enum import IntEnum
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
 from foundpose.geometry import Crops
-from foundpose.pnp import PnpStatus, PoseCandidates
+from foundpose.pnp import PnpStatus, PoseCandidates, TemplatePoses
 from foundpose.refinement.base import RefinedPoses
 from foundpose.retrieval import QueryPatches, RetrievedTemplates
 
@@ -21,10 +22,13 @@ class PoseStatus(IntEnum):
     TOO_FEW_INLIERS = PnpStatus.TOO_FEW_INLIERS
     UNUSABLE_MASK = 100
     NO_PATCHES = 101
+    NO_TEMPLATE = 102
 
 
 class Correspondences(NamedTuple):
     """2D-3D correspondences of B crops with h retrieved templates each.
+
+    Where poses are those of templates (:class:`foundpose.pnp.TopTemplatePose`) nothing is matched, and P is 0.
 
     Attributes:
         points_image: (B, P, 2) patch centres in the crop, pixels.
@@ -49,14 +53,17 @@ class PoseHypotheses(NamedTuple):
     Attributes:
         T_crop_from_model: (B, h, 4, 4), mesh units.
         inliers: (B, h, P) bool.
-        num_inliers: (B, h).
+        num_inliers: (B, h); 0 without correspondences.
         status: (B, h) codes of :class:`PoseStatus`.
+        score: (B, h) the share of the crop's patches that are inliers; for poses of templates the similarity of the
+            template. The larger the better; means nothing where the status is not OK.
     """
 
     T_crop_from_model: Tensor
     inliers: Tensor
     num_inliers: Tensor
     status: Tensor
+    score: Tensor
 
 
 class PoseEstimates(NamedTuple):
@@ -64,10 +71,12 @@ class PoseEstimates(NamedTuple):
 
     Attributes:
         T_camera_from_model: (B, 4, 4), mesh units; finite but meaningless where not valid.
-        score: (B,) confidence: the share of the crop's patches that are inliers, in [0, 1], or with a refiner the
-            refiner's score (0 for a pose that could not be refined and is returned as it was).
+        score: (B,) confidence: the share of the crop's patches that are inliers, in [0, 1], or for poses of templates
+            the similarity of the template, at most 1; with a refiner the refiner's score (0 for a pose that could not
+            be refined and is returned as it was).
         num_inliers: (B,) inlier correspondences of the chosen hypothesis, the quality by which the best of h is
-            chosen (with a refiner of several: chosen by its score).
+            chosen (with a refiner of several: chosen by its score). For poses of templates it is 0, and the most
+            similar template is chosen.
         valid: (B,) bool, a pose with at least the fewest inliers that the PnP stage asks for. It is no confidence:
             noise can reach that many by chance. Judge by ``score``.
         status: (B,) codes of :class:`PoseStatus`.
@@ -97,3 +106,29 @@ class PoseEstimates(NamedTuple):
     hypotheses: PoseHypotheses
     candidates: PoseCandidates | None = None
     refined: RefinedPoses | None = None
+
+
+def no_correspondences(query: QueryPatches, templates: RetrievedTemplates) -> Correspondences:
+    """What stands where nothing was matched: no point of any crop."""
+    B, h = templates.index.shape
+    pixels = query.pixels
+    nothing = pixels.new_zeros(B, h, 0)
+    return Correspondences(
+        points_image=pixels.new_zeros(B, 0, 2),
+        points_model=pixels.new_zeros(B, h, 0, 3),
+        pixels_template=pixels.new_zeros(B, h, 0, 2),
+        distance=nothing,
+        weight=nothing,
+        valid=nothing.bool(),
+    )
+
+
+def template_hypotheses(poses: TemplatePoses, templates: RetrievedTemplates) -> PoseHypotheses:
+    """Aligned templates as hypotheses, as good as the templates are similar."""
+    return PoseHypotheses(
+        T_crop_from_model=poses.T_crop_from_model,
+        inliers=torch.zeros_like(templates.valid).unsqueeze(-1)[..., :0],
+        num_inliers=torch.zeros_like(poses.status),
+        status=poses.status.masked_fill(~templates.valid, int(PoseStatus.NO_TEMPLATE)),
+        score=templates.similarity,
+    )

@@ -1,26 +1,32 @@
 """The composed method: from images and masks to poses."""
 
 import warnings
-from collections.abc import Callable, Sequence
-from typing import Any, TypeVar, cast, get_args
+from collections.abc import Sequence
+from typing import cast, get_args
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from foundpose.estimates import Correspondences, PoseEstimates, PoseHypotheses, PoseStatus
+from foundpose.estimates import (
+    Correspondences,
+    PoseEstimates,
+    PoseHypotheses,
+    PoseStatus,
+    no_correspondences,
+    template_hypotheses,
+)
 from foundpose.features.base import Fingerprint, PatchExtractor, PatchFeatures
 from foundpose.geometry import Crops, PerspectiveCrop, invert_transform
+from foundpose.grouping import combine, crops_of_objects, object_of_each_crop, take_rows
 from foundpose.matching import PatchMatcher, SoftPatchMatcher
 from foundpose.onboarding import ObjectRepresentation, RepresentationInfo
-from foundpose.pnp import PoseCandidates, RansacPnp
+from foundpose.pnp import PoseCandidates, RansacPnp, TemplatePoses, TopTemplatePose
 from foundpose.pnp.soft_selection import choose_softly
 from foundpose.refinement import PoseProposals, PoseRefiner
 from foundpose.rendering import Mesh
-from foundpose.retrieval import QueryPatches, RetrievedTemplates, TemplateRetriever
+from foundpose.retrieval import QueryPatches, RetrievedTemplates, Retriever
 from foundpose.selection import RefineWhat, choose_coarse, choose_refined, hypotheses_to_refine
-
-_Fields = TypeVar("_Fields", bound=tuple[Any, ...])
 
 
 class _ExtractorChecks:
@@ -57,19 +63,21 @@ class FoundPose(nn.Module):
         extractor: describes their patches; must be the one that the objects were onboarded with.
         retriever: finds similar templates.
         matcher: matches patches of crop and template.
-        pnp: estimates a pose from each template's correspondences.
+        pnp: estimates a pose from each template's correspondences. With :class:`TopTemplatePose` the poses are those
+            of the templates themselves: nothing is matched, the correspondences are empty (P = 0), and the most
+            similar template's pose is the best.
         refiner: improves poses; None returns coarse ones.
-        refine: "best": refine the hypothesis with the most inliers. "all": refine those of all retrieved templates
-            and keep the one with the best refined score.
+        refine: "best": refine the hypothesis with the most inliers (or of the most similar template). "all": refine
+            those of all retrieved templates and keep the one with the best refined score.
     """
 
     def __init__(
         self,
         crop: PerspectiveCrop,
         extractor: PatchExtractor,
-        retriever: TemplateRetriever,
+        retriever: Retriever,
         matcher: PatchMatcher | SoftPatchMatcher,
-        pnp: RansacPnp,
+        pnp: RansacPnp | TopTemplatePose,
         refiner: PoseRefiner | None = None,
         refine: RefineWhat = "best",
     ) -> None:
@@ -125,13 +133,18 @@ class FoundPose(nn.Module):
         crops: Crops = self.crop(images, K, masks, boxes, image_index)
         if len(crops.images) == 0:
             raise ValueError("there is nothing to estimate: masks or boxes have length 0")
-        members = _members(object_index, len(crops.images), len(objects))
+        members = crops_of_objects(object_index, len(crops.images), len(objects))
         features = self.extractor(crops.images)
         # Autocast is for the extractor: elsewhere half precision moves points and changes neighbours.
         with torch.autocast(crops.images.device.type, enabled=False):
             raw = select_query_patches(features, crops, self.extractor)
-            query, templates, correspondences = self._match(objects, members, raw)
-            hypotheses, candidates = self._solve(correspondences, crops)
+            query, templates, found = self._search(objects, members, raw, crops)
+            if isinstance(found, TemplatePoses):
+                correspondences, candidates = no_correspondences(query, templates), None
+                hypotheses = template_hypotheses(found, templates)
+            else:
+                correspondences = found
+                hypotheses, candidates = self._solve(correspondences, query, crops)
             estimates = choose_coarse(crops, query, templates, correspondences, hypotheses, candidates)
             if self.refiner is None:
                 return estimates
@@ -140,7 +153,7 @@ class FoundPose(nn.Module):
                 T_crop_from_model=torch.take_along_dim(
                     hypotheses.T_crop_from_model, rank[..., None, None], dim=1
                 ),
-                score=hypotheses.num_inliers.gather(1, rank).to(crops.K_crop.dtype),
+                score=hypotheses.score.gather(1, rank).to(crops.K_crop.dtype),
                 valid=(hypotheses.status.gather(1, rank) == PoseStatus.OK) & crops.valid[:, None],
                 template_index=templates.index.gather(1, rank),
                 crops=crops,
@@ -148,7 +161,7 @@ class FoundPose(nn.Module):
                 stride=self.extractor.stride,
                 offset=self.extractor.offset,
                 objects=objects,
-                object_index=_object_of_each_crop(members),
+                object_index=object_of_each_crop(members),
                 images=images,
                 K=K,
                 image_index=torch.arange(len(crops.images)) if image_index is None else image_index,
@@ -173,7 +186,9 @@ class FoundPose(nn.Module):
 
     def _warn_of_other_settings(self, representation: ObjectRepresentation) -> None:
         """Templates and crops can be compared, but badly, if they were made with other settings."""
-        mine = {"fill": self.crop.fill, "bow": repr(self.retriever.bow)}
+        mine: dict[str, str | float] = {"fill": self.crop.fill}
+        if isinstance(self.retriever, Retriever):
+            mine |= self.retriever.onboarding_settings()
         for name, value in mine.items():
             theirs = representation.info.settings.get(name, value)
             if theirs != value:
@@ -183,31 +198,40 @@ class FoundPose(nn.Module):
                     stacklevel=4,
                 )
 
-    def _match(
-        self, objects: list[ObjectRepresentation], members: list[Tensor], raw: QueryPatches
-    ) -> tuple[QueryPatches, RetrievedTemplates, Correspondences]:
+    def _search(
+        self, objects: list[ObjectRepresentation], members: list[Tensor], raw: QueryPatches, crops: Crops
+    ) -> tuple[QueryPatches, RetrievedTemplates, Correspondences | TemplatePoses]:
         """Retrieve and match object by object: the crops of one object share its words and templates."""
         parts = []
         for representation, crop_index in zip(objects, members, strict=True):
             if len(crop_index) > 0:
                 rows = crop_index.to(raw.valid.device)
-                parts.append(self._match_object(representation, _take_rows(raw, rows)))
+                parts.append(self._search_object(representation, take_rows(raw, rows), crops, rows))
         # Back to the order of the batch.
         order = torch.cat(members).argsort()
 
         def join(fields: list[Tensor]) -> Tensor:
             return torch.cat(fields)[order.to(fields[0].device)]
 
-        queries, retrieved, matched = zip(*parts, strict=True)
-        return _combine(queries, join), _combine(retrieved, join), _combine(matched, join)
+        queries, retrieved, found = zip(*parts, strict=True)
+        return combine(queries, join), combine(retrieved, join), combine(found, join)
 
-    def _match_object(
-        self, representation: ObjectRepresentation, raw: QueryPatches
-    ) -> tuple[QueryPatches, RetrievedTemplates, Correspondences]:
-        """Project, retrieve and match crops of one object."""
+    def _search_object(
+        self, representation: ObjectRepresentation, raw: QueryPatches, crops: Crops, rows: Tensor
+    ) -> tuple[QueryPatches, RetrievedTemplates, Correspondences | TemplatePoses]:
+        """Project and retrieve, then match or align templates, for the patches ``raw`` of some of the crops."""
         descriptors = raw.descriptors.to(representation.projection.components.dtype)
         query = raw._replace(descriptors=representation.projection(descriptors))
         templates = self.retriever(query, representation)
+        if isinstance(self.pnp, TopTemplatePose):
+            poses = self.pnp(crops.masks[rows], crops.K_crop[rows], templates.index, representation)
+            return query, templates, poses
+        return query, templates, self._match(representation, query, templates)
+
+    def _match(
+        self, representation: ObjectRepresentation, query: QueryPatches, templates: RetrievedTemplates
+    ) -> Correspondences:
+        """Match crops of one object with their templates."""
         patches = representation.gather_templates(templates.index)
         template_valid = patches.valid & templates.valid.unsqueeze(-1)
         matches = self.matcher(
@@ -219,7 +243,7 @@ class FoundPose(nn.Module):
             patches.points_model,
         )
         chosen = matches.template_patch.unsqueeze(-1)
-        correspondences = Correspondences(
+        return Correspondences(
             points_image=query.pixels,
             points_model=matches.points_model.to(query.pixels),
             pixels_template=patches.pixels.gather(2, chosen.expand(-1, -1, -1, 2)).to(query.pixels),
@@ -227,14 +251,15 @@ class FoundPose(nn.Module):
             weight=matches.weight.to(query.pixels),
             valid=matches.valid,
         )
-        return query, templates, correspondences
 
     def _solve(
-        self, correspondences: Correspondences, crops: Crops
+        self, correspondences: Correspondences, query: QueryPatches, crops: Crops
     ) -> tuple[PoseHypotheses, PoseCandidates | None]:
         """PnP for all crops and templates as one batch."""
         B, h, P = correspondences.valid.shape
-        result = self.pnp(
+        num_patches = query.valid.sum(dim=1, keepdim=True).clamp(min=1)
+        pnp = cast(RansacPnp, self.pnp)  # the other kind has no correspondences
+        result = pnp(
             correspondences.points_image.unsqueeze(1).expand(-1, h, -1, -1).reshape(B * h, P, 2),
             correspondences.points_model.reshape(B * h, P, 3),
             crops.K_crop.unsqueeze(1).expand(-1, h, -1, -1).reshape(B * h, 3, 3),
@@ -246,13 +271,14 @@ class FoundPose(nn.Module):
             inliers=result.inliers.reshape(B, h, P),
             num_inliers=result.num_inliers.reshape(B, h),
             status=result.status.reshape(B, h),
+            score=result.num_inliers.reshape(B, h) / num_patches,
         )
-        if result.candidates is None or self.pnp.soft_selection is None:
+        if result.candidates is None or pnp.soft_selection is None:
             return hypotheses, None
         # One choice among the candidates of all templates of a crop, in place of one for each template.
         T, score, _, valid = (x.unflatten(0, (B, h)).flatten(1, 2) for x in result.candidates)
         T = invert_transform(crops.T_crop_from_camera).unsqueeze(1) @ T
-        return hypotheses, choose_softly(T, score, valid, self.pnp.soft_selection.temperature)
+        return hypotheses, choose_softly(T, score, valid, pnp.soft_selection.temperature)
 
 
 def select_query_patches(features: PatchFeatures, crops: Crops, extractor: PatchExtractor) -> QueryPatches:
@@ -286,42 +312,3 @@ def select_query_patches(features: PatchFeatures, crops: Crops, extractor: Patch
     descriptors = features.patches.flatten(2).transpose(1, 2)
     descriptors = descriptors.gather(1, order.unsqueeze(-1).expand(-1, -1, descriptors.shape[-1]))
     return QueryPatches(descriptors, pixels.reshape(-1, 2)[order], valid.gather(1, order), features.cls)
-
-
-def _members(object_index: Tensor | None, count: int, num_objects: int) -> list[Tensor]:
-    """Crops of each object, as index tensors."""
-    if object_index is None:
-        if num_objects != 1:
-            raise ValueError(f"object_index (B,) is needed to tell {num_objects} objects apart")
-        return [torch.arange(count)]
-    if object_index.shape != (count,) or object_index.is_floating_point():
-        raise ValueError(
-            f"object_index must be ({count},) integers, got {tuple(object_index.shape)} {object_index.dtype}"
-        )
-    labels = object_index.cpu()
-    if count and (int(labels.min()) < 0 or int(labels.max()) >= num_objects):
-        raise ValueError(f"object_index must lie in [0, {num_objects}), got {labels.tolist()}")
-    return [torch.nonzero(labels == i).flatten() for i in range(num_objects)]
-
-
-def _object_of_each_crop(members: list[Tensor]) -> Tensor:
-    """(B,) from the crops of each object."""
-    index = torch.empty(sum(len(rows) for rows in members), dtype=torch.int64)
-    for i, rows in enumerate(members):
-        index[rows] = i
-    return index
-
-
-def _take_rows(part: _Fields, rows: Tensor) -> _Fields:
-    """Some rows of a named tuple of tensors."""
-    return _combine([part], lambda fields: fields[0][rows])
-
-
-def _combine(parts: Sequence[_Fields], combine: Callable[[list[Tensor]], Tensor]) -> _Fields:
-    """Combine named tuples of tensors field by field; a field that is None stays None."""
-    fields = [
-        None if any(tensor is None for tensor in field) else combine(list(field))
-        for field in zip(*parts, strict=True)
-    ]
-    make = cast(Callable[..., _Fields], type(parts[0]))
-    return make(*fields)

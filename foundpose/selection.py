@@ -33,12 +33,12 @@ def choose_coarse(
     status = torch.where(query.valid.any(dim=1), status, torch.full_like(status, PoseStatus.NO_PATCHES))
     status = torch.where(crops.valid, status, torch.full_like(status, PoseStatus.UNUSABLE_MASK))
     valid = status == PoseStatus.OK
-    num_inliers = hypotheses.num_inliers[row, best] * valid
+    score = hypotheses.score[row, best]
     T = invert_transform(crops.T_crop_from_camera) @ hypotheses.T_crop_from_model[row, best]
     return PoseEstimates(
         T_camera_from_model=T,
-        score=num_inliers / query.valid.sum(dim=1).clamp(min=1),
-        num_inliers=num_inliers,
+        score=torch.where(valid, score, torch.zeros_like(score)),
+        num_inliers=hypotheses.num_inliers[row, best] * valid,
         valid=valid,
         status=status,
         best=best,

@@ -18,10 +18,21 @@ from foundpose.geometry import (
 from foundpose.losses import PointMatchingLoss
 from foundpose.matching import PatchMatcher, SoftPatchMatcher
 from foundpose.onboarding import Onboarder
-from foundpose.pnp import GaussNewtonPnp, RansacPnp, SoftInlierSelection
+from foundpose.pnp import GaussNewtonPnp, RansacPnp, SoftInlierSelection, TopTemplatePose
+from foundpose.records import pose_records
+from foundpose.refinement import FeaturemetricRefiner
 from foundpose.rendering import CoordinateRenderer, RaycastRenderer
 from foundpose.rendering.coordinates import render_coordinate_image
-from foundpose.retrieval import SoftAssignBow, TemplateRetriever, VisualWords
+from foundpose.retrieval import (
+    ClsRetriever,
+    PatchVoteRetriever,
+    RetrievedTemplates,
+    Retriever,
+    SoftAssignBow,
+    TemplateRetriever,
+    VisualWords,
+)
+from foundpose.retrieval.base import select_templates
 from foundpose.synthetic import cluttered_scene, procedural_mesh
 
 SIZE = (480, 640)
@@ -320,3 +331,189 @@ def test_a_loss_on_the_pose_reaches_the_extractor(blob, matcher, soft_selection,
     assert value > 0
     value.backward()
     assert_useful_gradients(extractor)
+
+
+def estimate_scene(pipeline, scene, representation):
+    image, masks, _ = scene
+    with torch.no_grad():
+        return pipeline(image[None], K[None], representation, masks=masks, image_index=torch.tensor([0, 0]))
+
+
+def in_half_precision(representation):
+    halved = copy.deepcopy(representation)
+    halved.descriptors = halved.descriptors.half()
+    return halved
+
+
+@pytest.mark.parametrize("retriever", [TemplateRetriever(SoftAssignBow()), PatchVoteRetriever()])
+def test_retrievers_and_descriptors_in_half_precision(scene, oracle_blob, blob, retriever):
+    full = estimate_scene(make_pipeline(retriever=retriever), scene, oracle_blob)
+    half = estimate_scene(make_pipeline(retriever=retriever), scene, in_half_precision(oracle_blob))
+    for e in (full, half):
+        assert e.valid.all()
+        angle, distance = errors(e, scene[2])
+        assert angle.max() < 2.0
+        assert distance.max() < 0.05 * blob.diameter
+        assert e.templates.similarity.dtype == e.correspondences.distance.dtype == torch.float32
+    torch.testing.assert_close(half.templates.similarity, full.templates.similarity, rtol=0, atol=2e-3)
+    refined = make_pipeline(retriever=retriever, refiner=FeaturemetricRefiner())
+    e = estimate_scene(refined, scene, in_half_precision(oracle_blob))
+    assert e.refined.valid.all()
+
+
+def test_patch_votes_find_templates_seen_from_about_the_same_side(scene, oracle_blob):
+    """Codes of true coordinates do not tell in which way up the object is, but they tell which side is seen."""
+    e = estimate_scene(make_pipeline(retriever=PatchVoteRetriever()), scene, oracle_blob)
+    seen = (e.crops.T_crop_from_camera @ scene[2])[:, 2, :3]
+    cosine = seen @ oracle_blob.T_template_from_model[:, 2, :3].T
+    rank = cosine.argsort(dim=1, descending=True).argsort(dim=1).gather(1, e.templates.index)
+    assert (rank[:, 0] < 10).all()
+    assert rank.max() < 30
+
+
+class NearestTemplates(Retriever):
+    """Knows the true poses in the crops and retrieves templates of about the same orientation."""
+
+    def __init__(self, scene, num_templates=5):
+        super().__init__(num_templates)
+        image, masks, T_true = scene
+        crops = PerspectiveCrop()(image[None], K[None], masks, image_index=torch.tensor([0, 0]))
+        self.R = (crops.T_crop_from_camera @ T_true)[:, None, :3, :3]
+
+    def forward(self, query, index):
+        similarity = self.R.new_tensor(1.0) - rotation_angle(self.R, index.T_template_from_model[:, :3, :3])
+        return select_templates(similarity, query.valid.any(dim=1), self.num_templates)
+
+
+def test_cls_tokens_retrieve(blob):
+    extractor, _, representation = small_transformer(blob)
+    T, intrinsics = representation.T_template_from_model[:6], representation.K_template[:6]
+    render = RaycastRenderer()(blob, T, intrinsics, (420, 420))
+    pipeline = make_pipeline(
+        extractor, retriever=ClsRetriever(3), crop=PerspectiveCrop(background="black"), pnp=TopTemplatePose()
+    )
+    with torch.no_grad(), warnings.catch_warnings():
+        warnings.simplefilter("error")  # a bag of words is nothing that this retriever relies on
+        e = pipeline(render.rgb, intrinsics, representation, masks=render.mask)
+    assert (e.templates.index[:, 0] == torch.arange(6)).sum() >= 5
+    assert e.valid.all()
+    with pytest.raises(ValueError, match="the extractor gives no cls token"):
+        estimate_scene(make_pipeline(retriever=ClsRetriever()), scene_of(blob), oracle_of(blob))
+
+
+def scene_of(blob):
+    picture = cluttered_scene(blob, seed=3)
+    return picture.image, picture.mask.expand(2, -1, -1), None
+
+
+def oracle_of(blob):
+    return Onboarder(
+        CoordinateRenderer(),
+        CoordinateCode(),
+        SuperFibonacci(6),
+        VisualWords(20),
+        SoftAssignBow(),
+        projection=PcaProjection(16),
+    )(blob, "blob")
+
+
+def test_pose_of_the_top_template(scene, oracle_blob, blob):
+    pipeline = make_pipeline(pnp=TopTemplatePose(), retriever=NearestTemplates(scene), matcher=None)
+    e = estimate_scene(pipeline, scene, oracle_blob)
+    assert e.valid.all()
+    assert (e.best == 0).all()
+    assert torch.equal(e.score, e.templates.similarity[:, 0])
+    assert (e.num_inliers == 0).all()
+    assert e.correspondences.points_model.shape == (2, 5, 0, 3)
+    assert e.hypotheses.inliers.shape == (2, 5, 0)
+    angle, _ = errors(e, scene[2])
+    # As far off as the nearest template, and not farther.
+    torch.testing.assert_close(torch.deg2rad(angle), 1.0 - e.templates.similarity[:, 0], rtol=0, atol=0.02)
+    # Across the viewing ray, the place is much better known than along it.
+    centre = blob.bounds.mean(0).float()
+    seen, true = (T[:, :3, :3] @ centre + T[:, :3, 3] for T in (e.T_camera_from_model, scene[2]))
+    assert ((seen / seen[:, 2:] - true / true[:, 2:])[:, :2] * 600).abs().max() < 10
+    assert (seen[:, 2] / true[:, 2] - 1).abs().max() < 0.1
+    assert [r["status"] for r in pose_records(e)] == ["OK", "OK"]
+
+
+@pytest.mark.parametrize("refine", ["best", "all"])
+def test_pose_of_a_template_is_a_start_for_refiners(scene, oracle_blob, refine):
+    settings = {"pnp": TopTemplatePose(), "retriever": NearestTemplates(scene), "refine": refine}
+    coarse = estimate_scene(make_pipeline(**settings), scene, oracle_blob)
+    refined = estimate_scene(make_pipeline(**settings, refiner=FeaturemetricRefiner()), scene, oracle_blob)
+    assert refined.refined.valid.all()
+    if refine == "best":
+        torch.testing.assert_close(refined.T_coarse, coarse.T_camera_from_model)
+    before, after = errors(coarse, scene[2]), errors(refined, scene[2])
+    assert (after[0] < 0.5 * before[0]).all()
+    assert after[1].max() < 0.5 * before[1].max()
+
+
+def test_poses_of_templates_alone_as_in_a_batch_and_unusable_masks(scene, oracle_blob, oracle_onboarder):
+    image, masks, _ = scene
+    other = oracle_onboarder(procedural_mesh(8, subdivisions=4), "other")
+    thin = torch.zeros(2, *SIZE, dtype=torch.bool)
+    thin[1, 100, 100:400] = True
+    all_masks = torch.cat([masks[:1], thin, masks[1:], masks[1:]])
+    which = torch.tensor([0, 0, 0, 1, 0])
+    pipeline = make_pipeline(pnp=TopTemplatePose())
+    with torch.no_grad():
+        batch = pipeline(
+            image[None],
+            K[None],
+            [oracle_blob, other],
+            masks=all_masks,
+            image_index=torch.zeros(5).long(),
+            object_index=which,
+        )
+        alone = [
+            pipeline(image[None], K[None], [oracle_blob, other][which[b]], masks=all_masks[b : b + 1])
+            for b in range(5)
+        ]
+    expected = [PoseStatus.OK, PoseStatus.UNUSABLE_MASK, PoseStatus.NO_PATCHES, PoseStatus.OK, PoseStatus.OK]
+    assert batch.status.tolist() == expected
+    assert [int(e.status) for e in alone] == expected
+    assert torch.isfinite(batch.T_camera_from_model).all()
+    assert (batch.score[1:3] == 0).all()
+    for b in (0, 3, 4):
+        torch.testing.assert_close(
+            batch.T_camera_from_model[b], alone[b].T_camera_from_model[0], rtol=1e-4, atol=1e-2
+        )
+
+
+class NothingFound(Retriever):
+    """Retrieves no template, or but one."""
+
+    def __init__(self, found):
+        super().__init__(2)
+        self.found = found
+
+    def forward(self, query, index):
+        B = len(query.valid)
+        valid = torch.tensor([self.found, False]).expand(B, 2)
+        similarity = torch.where(valid, 0.5, -torch.inf)
+        return RetrievedTemplates(torch.zeros(B, 2).long(), similarity, valid)
+
+
+def test_no_template(scene, oracle_blob):
+    e = estimate_scene(
+        make_pipeline(pnp=TopTemplatePose(), retriever=NothingFound(False)), scene, oracle_blob
+    )
+    assert (e.status == PoseStatus.NO_TEMPLATE).all()
+    assert not e.valid.any()
+    assert (e.score == 0).all()
+    assert torch.isfinite(e.T_camera_from_model).all()
+    e = estimate_scene(make_pipeline(pnp=TopTemplatePose(), retriever=NothingFound(True)), scene, oracle_blob)
+    assert e.valid.all()
+    assert e.hypotheses.status.tolist() == [[PoseStatus.OK, PoseStatus.NO_TEMPLATE]] * 2
+
+
+def test_gradients_of_a_templates_pose_reach_the_camera(scene, oracle_blob):
+    image, masks, T_true = scene
+    camera = K[None].clone().requires_grad_()
+    e = make_pipeline(pnp=TopTemplatePose())(image[None], camera, oracle_blob, masks=masks[:1])
+    ((e.T_camera_from_model - T_true[:1])[:, :3] ** 2).sum().backward()
+    assert torch.isfinite(camera.grad).all()
+    # A longer focal length puts the object farther away.
+    assert camera.grad[0, 0, 0].abs() > 0

@@ -1,28 +1,38 @@
 """Patch extractors, token hooks and PCA.
 
-Nothing here imports transformers before a ``DinoV2`` is constructed.
+Nothing here imports transformers before an extractor that needs it is constructed, and nothing imports torchvision.
 """
 
 from foundpose.features.adapter import AdaptedExtractor, ResidualAdapter
 from foundpose.features.base import Fingerprint, PatchExtractor, PatchFeatures
+from foundpose.features.clip import Clip
 from foundpose.features.dense_sift import DenseSift
 from foundpose.features.dinov2 import DinoV2
-from foundpose.features.dinov2_checkpoints import WeightsNotFoundError
+from foundpose.features.dinov3 import DinoV3
 from foundpose.features.hook import FeatureHook
+from foundpose.features.loftr import LoftrBackbone
 from foundpose.features.oracle import CoordinateCode, PatchNoise
 from foundpose.features.pca import PcaProjection
+from foundpose.features.s2dnet import S2DNet
+from foundpose.features.sam import Sam
+from foundpose.features.weights import WeightsNotFoundError
 
 __all__ = [
     "AdaptedExtractor",
+    "Clip",
     "CoordinateCode",
     "DenseSift",
     "DinoV2",
+    "DinoV3",
     "FeatureHook",
     "Fingerprint",
+    "LoftrBackbone",
     "PatchExtractor",
     "PatchFeatures",
     "PatchNoise",
     "PcaProjection",
     "ResidualAdapter",
+    "S2DNet",
+    "Sam",
     "WeightsNotFoundError",
 ]

@@ -6,21 +6,22 @@ modules, which change between versions.
 """
 
 import re
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import torch
 from torch import Tensor, nn
 
+from foundpose.features.weights import (
+    ConfigValue,
+    build_transformers,
+    check_sizes,
+    how_to_get_hub_weights,
+    load_transformers,
+    read_checkpoint,
+)
+
 PATCH_SIZE = 14
-
-ConfigValue = int | float | bool
-
-
-class WeightsNotFoundError(FileNotFoundError):
-    """Weights are neither on this machine nor could they be fetched; the message says how to get them."""
 
 
 class DinoV2Architecture(NamedTuple):
@@ -76,11 +77,10 @@ def original_checkpoint_url(variant: str) -> str:
 
 def how_to_get_weights(variant: str) -> str:
     """Instructions for people, for error messages."""
-    repository, url = hub_repository(variant), original_checkpoint_url(variant)
+    url = original_checkpoint_url(variant)
     return (
-        f"To get the weights of {variant}, on a machine with a network either run\n"
-        f"  hf download {repository} --local-dir DIR\n"
-        f"and pass weights=DIR, or download the original checkpoint\n"
+        f"{how_to_get_hub_weights(variant, hub_repository(variant), 'either ')}, "
+        f"or download the original checkpoint\n"
         f"  {url}\n"
         f"and pass weights=/path/to/{url.rsplit('/', 1)[1]}"
     )
@@ -119,51 +119,33 @@ def load_pretrained(
         WeightsNotFoundError: nothing at ``source``.
         ValueError: the weights are those of another variant, or incomplete.
     """
-    path = Path(source)
-    if source == "hub":
-        return _load_transformers(hub_repository(variant), variant, architecture, blocks)
-    if path.is_dir():
-        return _load_transformers(str(path), variant, architecture, blocks)
+    path, how = Path(source), how_to_get_weights(variant)
     if path.is_file():
         return _load_original(path, variant, architecture, blocks)
-    raise WeightsNotFoundError(f"no DINOv2 weights at {path}.\n{how_to_get_weights(variant)}")
-
-
-def _load_transformers(source: str, variant: str, architecture: DinoV2Architecture, blocks: int) -> nn.Module:
-    from transformers import AutoConfig
-
-    config = build_config(architecture, blocks)
-    try:
-        found = AutoConfig.from_pretrained(source)
-        if found.model_type != config.model_type:
-            raise ValueError(
-                f"{source} holds a {found.model_type!r} model, but variant {variant} is {config.model_type!r}"
-            )
-        _check_sizes({name: getattr(found, name, 0) for name in architecture._fields}, architecture, source)
-        return _from_pretrained(source, config, None, architecture, source)
-    except OSError as error:
-        raise WeightsNotFoundError(
-            f"could not load DINOv2 weights from {source}: {error}\n{how_to_get_weights(variant)}"
-        ) from error
+    return load_transformers(
+        source,
+        hub_repository(variant),
+        model_class(architecture),
+        build_config(architecture, blocks),
+        architecture,
+        variant,
+        VARIANTS,
+        how,
+    )
 
 
 def _load_original(path: Path, variant: str, architecture: DinoV2Architecture, blocks: int) -> nn.Module:
-    try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:
-        raise ValueError(
-            f"{path} is not a checkpoint that torch.load can read: {error}\n{how_to_get_weights(variant)}"
-        ) from error
-    if not isinstance(state, Mapping) or "pos_embed" not in state or "blocks.0.norm1.weight" not in state:
-        names = list(state)[:5] if isinstance(state, Mapping) else type(state).__name__
+    state = read_checkpoint(path, how_to_get_weights(variant))
+    if "pos_embed" not in state or "blocks.0.norm1.weight" not in state:
         raise ValueError(
             f"{path} is not an original DINOv2 backbone checkpoint (keys such as pos_embed and "
-            f"blocks.0.norm1.weight); it holds {names}"
+            f"blocks.0.norm1.weight); it holds {list(state)[:5]}"
         )
     found = original_architecture(state) | {"num_attention_heads": architecture.num_attention_heads}
-    _check_sizes(found, architecture, str(path))
+    check_sizes(found, architecture._asdict(), str(path), VARIANTS)
     config = build_config(architecture, blocks)
-    return _from_pretrained(None, config, convert_original(state, blocks), architecture, str(path))
+    converted = convert_original(state, blocks)
+    return build_transformers(model_class(architecture), config, None, converted, str(path))
 
 
 def original_architecture(state: Mapping[str, Tensor]) -> dict[str, ConfigValue]:
@@ -216,55 +198,3 @@ def convert_original(state: Mapping[str, Tensor], blocks: int) -> dict[str, Tens
         else:
             converted[name] = value
     return converted
-
-
-def _check_sizes(found: Mapping[str, ConfigValue], architecture: DinoV2Architecture, source: str) -> None:
-    wanted = architecture._asdict()
-    wrong = {name: value for name, value in found.items() if value != wanted[name]}
-    if wrong:
-        differences = ", ".join(f"{name} {value} instead of {wanted[name]}" for name, value in wrong.items())
-        raise ValueError(
-            f"the weights in {source} do not fit the variant asked for: {differences}; "
-            f"choose the variant that they belong to, one of {', '.join(VARIANTS)}"
-        )
-
-
-def _from_pretrained(
-    source: str | None,
-    config: Any,
-    state: dict[str, Tensor] | None,
-    architecture: DinoV2Architecture,
-    origin: str,
-) -> nn.Module:
-    with _quiet_transformers():
-        model, info = model_class(architecture).from_pretrained(
-            source,
-            config=config,
-            state_dict=state,
-            attn_implementation="sdpa",
-            dtype=torch.float32,
-            output_loading_info=True,
-        )
-    # The blocks behind the hooked layer are left unread on purpose; nothing that was built may stay unread.
-    if info["missing_keys"] or info["mismatched_keys"]:
-        raise ValueError(
-            f"the weights in {origin} are incomplete: missing {sorted(info['missing_keys'])[:5]}, "
-            f"of the wrong shape {sorted(info['mismatched_keys'])[:5]}"
-        )
-    return model
-
-
-@contextmanager
-def _quiet_transformers() -> Iterator[None]:
-    """Keep transformers from reporting the blocks that are left out on purpose, and from drawing bars."""
-    from transformers.utils import logging
-
-    verbosity, bar = logging.get_verbosity(), logging.is_progress_bar_enabled()
-    logging.set_verbosity_error()
-    logging.disable_progress_bar()
-    try:
-        yield
-    finally:
-        logging.set_verbosity(verbosity)
-        if bar:
-            logging.enable_progress_bar()

@@ -1,7 +1,7 @@
 """Perspective crops: virtual pinhole cameras focused on image regions."""
 
 import math
-from typing import NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import torch
 import torch.nn.functional as F
@@ -11,19 +11,22 @@ from torch import Tensor, nn
 from foundpose.geometry.boxes import boxes_from_masks, masks_from_boxes
 from foundpose.geometry.cameras import camera_on_boxes
 
+Background = Literal["keep", "black"]
+
 
 class Crops(NamedTuple):
     """A batch of perspective crops.
 
     Attributes:
-        images: (B, 3, S, S), black where the crop camera looks beyond the image.
+        images: (B, 3, S, S), black where the crop camera looks beyond the image, and with a black background outside
+            the mask.
         masks: (B, S, S) in [0, 1], warped bilinearly; inside where above 0.5.
         K_crop: (B, 3, 3) intrinsics of the virtual cameras, pixels.
         T_crop_from_camera: (B, 4, 4) rotations of the virtual cameras.
         boxes: (B, 4) boxes in the image that the crops are focused on, pixel edges.
         valid: (B,) False for a mask that is empty or smaller than ``min_box_size``, for a box that is degenerate
-            or outside its image, and for intrinsics that are no camera's. Such a crop shows the whole image, its
-            mask is zero, and all of it is constant for autograd.
+            or outside its image, and for intrinsics that are no camera's. Such a crop shows the whole image (with a
+            black background nothing), its mask is zero, and all of it is constant for autograd.
     """
 
     images: Tensor
@@ -45,12 +48,21 @@ class PerspectiveCrop(nn.Module):
         fill: δ, share of the crop's side that the box takes, in (0, 1].
         antialias: filter the image where a crop shrinks it (trilinear sampling of a box-filtered pyramid).
         min_box_size: boxes whose longer side is less than this many pixels are flagged as not valid.
+        background: "keep", or "black": pixels outside the mask become 0, as templates have it. (The paper keeps the
+            background but for one row of its Table 2, since patches outside the mask count for nothing anyway.)
     """
 
     def __init__(
-        self, size: int = 420, fill: float = 0.6, antialias: bool = True, min_box_size: float = 2.0
+        self,
+        size: int = 420,
+        fill: float = 0.6,
+        antialias: bool = True,
+        min_box_size: float = 2.0,
+        background: Background = "keep",
     ) -> None:
         super().__init__()
+        if background not in get_args(Background):
+            raise ValueError(f"background must be one of {get_args(Background)}, got {background!r}")
         if size < 2:
             raise ValueError(f"size must be at least 2 pixels, got {size}")
         if not 0.0 < fill <= 1.0:
@@ -59,6 +71,7 @@ class PerspectiveCrop(nn.Module):
         self.fill = fill
         self.antialias = antialias
         self.min_box_size = min_box_size
+        self.background: Background = background
 
     def forward(
         self,
@@ -124,6 +137,8 @@ class PerspectiveCrop(nn.Module):
         crop_masks = warp_perspective(
             region[:, None], homographies.detach(), (self.size, self.size), align_corners=True
         )
+        if self.background == "black":
+            crops = torch.where(crop_masks > 0.5, crops, torch.zeros_like(crops))
         return Crops(crops, crop_masks[:, 0], K_crop, T_crop_from_camera, boxes, valid)
 
 

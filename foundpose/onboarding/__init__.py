@@ -1,16 +1,22 @@
 """From a mesh to an object representation."""
 
-from foundpose.onboarding.onboarder import Onboarder, Progress
+from foundpose.onboarding.artefacts import ArtefactEntry, ArtefactStore
+from foundpose.onboarding.cached import CachedOnboarding
+from foundpose.onboarding.onboarder import Onboarder
 from foundpose.onboarding.representation import (
     ObjectRepresentation,
     RepresentationInfo,
     TemplatePatches,
     read_info,
 )
+from foundpose.onboarding.stages import Progress
 from foundpose.onboarding.store import RepresentationStore
 from foundpose.onboarding.templates import TemplateCameras, register_patches, template_cameras
 
 __all__ = [
+    "ArtefactEntry",
+    "ArtefactStore",
+    "CachedOnboarding",
     "ObjectRepresentation",
     "Onboarder",
     "Progress",

@@ -1,41 +1,41 @@
 """From a mesh to an object representation."""
 
 import copy
+from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import chain
-from typing import NamedTuple, Protocol, get_args
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor, nn
 
 from foundpose.features.base import PatchExtractor
 from foundpose.features.pca import CovarianceAccumulator, PcaProjection
+from foundpose.onboarding.compression import dequantize, quantize
 from foundpose.onboarding.representation import ObjectRepresentation, RepresentationInfo
+from foundpose.onboarding.stages import (
+    FittedWords,
+    PatchTable,
+    Progress,
+    RawDescriptors,
+    TemplatePictures,
+    ignore_progress,
+)
 from foundpose.onboarding.templates import TemplateCameras, register_patches, template_cameras
 from foundpose.rendering import Mesh, Renderer
 from foundpose.retrieval import IdfMode, SoftAssignBow, VisualWords, WordAssignment
 from foundpose.retrieval.bow import inverse_document_frequency, tf_idf, word_counts
 from foundpose.retrieval.retriever import normalize_rows
 
-
-class Progress(Protocol):
-    """Is told how far a long computation has come."""
-
-    def __call__(self, stage: str, done: int, total: int) -> None:
-        """``done`` of ``total`` steps of ``stage`` are finished."""
-
-
-class _RawPatches(NamedTuple):
-    """Valid patches of all templates before projection, on the CPU."""
-
-    descriptors: list[Tensor]
-    points_model: list[Tensor]
-    patch_index: list[Tensor]
-    counts: list[Tensor]
-    cls: list[Tensor]
+Storage = Literal["float32", "float16"]
+_STORAGE_TYPES: dict[Storage, torch.dtype] = {"float32": torch.float32, "float16": torch.float16}
 
 
 class Onboarder(nn.Module):
     """Builds the representation of an object from its mesh (paper, "Template-based object representation").
+
+    :meth:`forward` does all of it and keeps nothing on disk. The methods below it are its stages, which
+    :class:`CachedOnboarding` runs as well, with files in between.
 
     Args:
         renderer: renders the templates.
@@ -50,6 +50,8 @@ class Onboarder(nn.Module):
         mask_erosion: template masks are eroded by a square of this many pixels (odd; 0 for none).
         idf_mode: "document" or "occurrence", see :func:`inverse_document_frequency`.
         batch_size: templates that are rendered and described at a time.
+        storage: type in which the representation keeps the patches' descriptors. "float16" halves their memory;
+            computations are in float32 all the same.
     """
 
     def __init__(
@@ -66,6 +68,7 @@ class Onboarder(nn.Module):
         mask_erosion: int = 5,
         idf_mode: IdfMode = "document",
         batch_size: int = 16,
+        storage: Storage = "float32",
     ) -> None:
         super().__init__()
         projection = PcaProjection() if projection is None else projection
@@ -84,6 +87,8 @@ class Onboarder(nn.Module):
             raise ValueError(f"distance must be more than one diameter, got {distance}")
         if batch_size < 1:
             raise ValueError(f"batch_size must be at least 1, got {batch_size}")
+        if storage not in get_args(Storage):
+            raise ValueError(f"storage must be one of {get_args(Storage)}, got {storage!r}")
         self.renderer = renderer
         self.extractor = extractor
         self.viewpoints = viewpoints
@@ -96,6 +101,7 @@ class Onboarder(nn.Module):
         self.mask_erosion = mask_erosion
         self.idf_mode: IdfMode = idf_mode
         self.batch_size = batch_size
+        self.storage: Storage = storage
 
     def settings(self) -> dict[str, str | int | float | bool | None]:
         """Settings that the representation depends on, beside mesh and extractor."""
@@ -110,9 +116,15 @@ class Onboarder(nn.Module):
             "mask_erosion": self.mask_erosion,
             "idf_mode": self.idf_mode,
             "renderer": repr(self.renderer),
+            "bits": self.renderer.bits,
+            "storage": self.storage,
         }
 
-    @torch.no_grad()  # clustering has no derivative, and a graph over all templates would fill the memory
+    @property
+    def device(self) -> torch.device:
+        """Device of the extractor's parameters and buffers (the CPU if it has none); the stages compute there."""
+        return next(chain(self.extractor.parameters(), self.extractor.buffers()), torch.empty(0)).device
+
     def forward(self, mesh: Mesh, name: str, progress: Progress | None = None) -> ObjectRepresentation:
         """Onboard an object.
 
@@ -122,29 +134,93 @@ class Onboarder(nn.Module):
             progress: is told of every batch of templates and of every later stage.
 
         Returns:
-            The representation, on the device of the extractor's parameters and buffers (the CPU if it has none).
+            The representation, on the extractor's device.
 
         Raises:
-            ValueError: too few patches for the PCA or the words.
+            ValueError: too few patches for the PCA or the words, or descriptors too large for ``storage``.
 
         Not differentiable: what comes out are constants of later stages.
         """
-        state = next(chain(self.extractor.parameters(), self.extractor.buffers()), torch.empty(0))
-        # Autocast would move template cameras and points; the extractor has a precision of its own.
-        with torch.autocast(state.device.type, enabled=False):
-            return self._onboard(mesh, name, state.device, progress or _no_progress)
+        report = progress or ignore_progress
+        with self.constants():
+            cameras = self.cameras(mesh)
+            tables, raw, cls = [], [], []
+            for batch, _ in self.batches(cameras, "templates", report):
+                pictures = self.render(mesh, batch)
+                table = self.register(mesh, batch, pictures.masks)
+                described = self.describe(pictures.levels, table)
+                tables.append(PatchTable(*(part.cpu() for part in table)))
+                raw.append(described.descriptors.cpu())
+                cls.append(described.template_cls.cpu())
+            patches = PatchTable(*(torch.cat(parts) for parts in zip(*tables, strict=True)))
+            fitted = self.fit(raw, report)
+            return self.assemble(mesh, name, cameras, patches, torch.cat(cls), fitted, report)
 
-    def _onboard(self, mesh: Mesh, name: str, device: torch.device, report: Progress) -> ObjectRepresentation:
-        rotations = self.viewpoints().to(device=device, dtype=torch.float32)
-        cameras = template_cameras(mesh, rotations, self.image_size, self.fill, self.distance)
-        raw, accumulator = self._describe_templates(mesh, cameras, report)
+    @contextmanager
+    def constants(self) -> Iterator[None]:
+        """Within it run the stages: without autograd and without autocast.
 
+        Clustering has no derivative and a graph over all templates would fill the memory; autocast would move
+        template cameras and points (the extractor has a precision of its own).
+        """
+        with torch.no_grad(), torch.autocast(self.device.type, enabled=False):
+            yield
+
+    def batches(
+        self, cameras: TemplateCameras, stage: str, report: Progress
+    ) -> Iterator[tuple[TemplateCameras, slice]]:
+        """Cameras of ``batch_size`` templates at a time, and which templates; each is reported when done with."""
+        total = len(cameras.K_template)
+        report(stage, 0, total)
+        for start in range(0, total, self.batch_size):
+            rows = slice(start, min(start + self.batch_size, total))
+            yield TemplateCameras(*(part[rows].to(self.device) for part in cameras)), rows
+            report(stage, rows.stop, total)
+
+    def cameras(self, mesh: Mesh) -> TemplateCameras:
+        """Cameras of all templates."""
+        rotations = self.viewpoints().to(device=self.device, dtype=torch.float32)
+        return template_cameras(mesh, rotations, self.image_size, self.fill, self.distance)
+
+    def render(self, mesh: Mesh, cameras: TemplateCameras) -> TemplatePictures:
+        """Render some templates. Their colours are rounded, as those of photographs are, so files lose nothing."""
+        render = self.renderer(mesh, *cameras, (self.image_size, self.image_size))
+        return TemplatePictures(quantize(render.rgb, self.renderer.bits), render.mask)
+
+    def register(self, mesh: Mesh, cameras: TemplateCameras, masks: Tensor) -> PatchTable:
+        """Find the valid patches of some templates and their 3D points."""
+        extractor = self.extractor
+        grid = extractor.grid_size(self.image_size)
+        found = register_patches(
+            self.renderer, mesh, cameras, masks, extractor.stride, extractor.offset, grid, self.mask_erosion
+        )
+        valid = found.valid.flatten(1)
+        points_model = found.points_model.flatten(1, 2)[valid]
+        return PatchTable(points_model, torch.nonzero(valid)[:, 1], valid.sum(dim=1))
+
+    def describe(self, levels: Tensor, patches: PatchTable) -> RawDescriptors:
+        """Describe some templates and their valid patches."""
+        features = self.extractor(dequantize(levels, self.renderer.bits))
+        template = torch.arange(len(levels), device=levels.device).repeat_interleave(patches.counts)
+        descriptors = features.patches.flatten(2).transpose(1, 2)[template, patches.patch_index].float()
+        cls = descriptors.new_empty(len(levels), 0) if features.cls is None else features.cls.float()
+        return RawDescriptors(descriptors, cls)
+
+    def fit(self, raw: list[Tensor], report: Progress) -> FittedWords:
+        """Fit projection and words.
+
+        Args:
+            raw: descriptors (m, C) of batches of templates; the list is emptied on the way, which frees memory.
+            report: is told of the progress.
+        """
         report("PCA", 0, 1)
-        projection = copy.deepcopy(self.projection).to(device).fit(accumulator)
-        # One batch at a time, freeing the raw descriptors on the way.
+        accumulator = CovarianceAccumulator(self.extractor.channels, self.device)
+        for batch in raw:
+            accumulator.update(batch.to(self.device))
+        projection = copy.deepcopy(self.projection).to(self.device).fit(accumulator)
         projected = []
-        while raw.descriptors:
-            projected.append(projection(raw.descriptors.pop(0).to(device)))
+        while raw:
+            projected.append(projection(raw.pop(0).to(self.device)))
         descriptors = torch.cat(projected)
         report("PCA", 1, 1)
 
@@ -152,22 +228,35 @@ class Onboarder(nn.Module):
         report("visual words", 0, most)
         words = self.words(descriptors, lambda done, _: report("visual words", min(done, most - 1), most))
         report("visual words", most, most)
+        return FittedWords(projection, words, descriptors)
 
-        counts = torch.cat(raw.counts)
+    def assemble(
+        self,
+        mesh: Mesh,
+        name: str,
+        cameras: TemplateCameras,
+        patches: PatchTable,
+        template_cls: Tensor,
+        fitted: FittedWords,
+        report: Progress,
+    ) -> ObjectRepresentation:
+        """Describe the templates by words and put the representation together, on the extractor's device."""
+        device = self.device
         grid = self.extractor.grid_size(self.image_size)
         cell_type = torch.int16 if grid**2 <= torch.iinfo(torch.int16).max else torch.int32
+        words, counts = fitted.words, patches.counts
         representation = ObjectRepresentation(
-            projection=projection,
+            projection=fitted.projection,
             words=words,
             idf=words.new_zeros(len(words)),
             template_bow=words.new_zeros(len(counts), len(words)),
-            descriptors=descriptors,
-            points_model=torch.cat(raw.points_model).to(device),
-            patch_index=torch.cat(raw.patch_index).to(device=device, dtype=cell_type),
-            template_offsets=torch.cat([counts.new_zeros(1), counts.cumsum(0)]).to(device),
+            descriptors=fitted.descriptors,
+            points_model=patches.points_model,
+            patch_index=patches.patch_index.to(cell_type),
+            template_offsets=torch.cat([counts.new_zeros(1), counts.cumsum(0)]),
             T_template_from_model=cameras.T_template_from_model,
             K_template=cameras.K_template,
-            template_cls=torch.cat(raw.cls).to(device) if raw.cls else None,
+            template_cls=template_cls if template_cls.shape[1] > 0 else None,
             info=RepresentationInfo(
                 name=name,
                 diameter=float(mesh.diameter),
@@ -179,49 +268,15 @@ class Onboarder(nn.Module):
                 grid=grid,
                 settings=self.settings(),
             ),
-        )
+        ).to(device)
         report("bags of words", 0, 1)
         idf, template_bow = describe_by_words(representation, self.bow, self.idf_mode)
         representation.idf.copy_(idf)
         representation.template_bow.copy_(template_bow)
+        # Only now: the templates' bags of words do not depend on how the descriptors are stored.
+        representation.descriptors = _stored(representation.descriptors, self.storage)
         report("bags of words", 1, 1)
         return representation
-
-    def _describe_templates(
-        self, mesh: Mesh, cameras: TemplateCameras, report: Progress
-    ) -> tuple[_RawPatches, CovarianceAccumulator]:
-        """Render all templates and describe their valid patches, batch by batch."""
-        device = cameras.K_template.device
-        grid = self.extractor.grid_size(self.image_size)
-        raw = _RawPatches([], [], [], [], [])
-        accumulator = CovarianceAccumulator(self.extractor.channels, device)
-        total = len(cameras.K_template)
-        report("templates", 0, total)
-        for start in range(0, total, self.batch_size):
-            batch = TemplateCameras(*(part[start : start + self.batch_size] for part in cameras))
-            render = self.renderer(mesh, *batch, (self.image_size, self.image_size))
-            registered = register_patches(
-                self.renderer,
-                mesh,
-                batch,
-                render.mask,
-                self.extractor.stride,
-                self.extractor.offset,
-                grid,
-                self.mask_erosion,
-            )
-            features = self.extractor(render.rgb)
-            valid = registered.valid.flatten(1)
-            descriptors = features.patches.flatten(2).transpose(1, 2)[valid].float()
-            accumulator.update(descriptors)
-            raw.descriptors.append(descriptors.cpu())
-            raw.points_model.append(registered.points_model.flatten(1, 2)[valid].cpu())
-            raw.patch_index.append(torch.nonzero(valid)[:, 1].cpu())
-            raw.counts.append(valid.sum(dim=1).cpu())
-            if features.cls is not None:
-                raw.cls.append(features.cls.float().cpu())
-            report("templates", min(start + self.batch_size, total), total)
-        return raw, accumulator
 
 
 def describe_by_words(
@@ -241,5 +296,12 @@ def describe_by_words(
     return idf, normalize_rows(tf_idf(word_counts(assignment, num_words), idf))
 
 
-def _no_progress(stage: str, done: int, total: int) -> None:
-    """Tell nobody."""
+def _stored(descriptors: Tensor, storage: Storage) -> Tensor:
+    """Descriptors in the type in which they are kept."""
+    stored = descriptors.to(_STORAGE_TYPES[storage])
+    if storage != "float32" and not bool(torch.isfinite(stored).all()):
+        raise ValueError(
+            f"descriptors of magnitude {float(descriptors.abs().max()):.3g} do not fit {storage}; "
+            "use storage=float32"
+        )
+    return stored

@@ -1,6 +1,7 @@
 """What is kept of an object after onboarding."""
 
 import json
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -73,7 +74,7 @@ class ObjectRepresentation(nn.Module):
         words: (k, d) visual words.
         idf: (k,) inverse document frequencies.
         template_bow: (T, k) L2-normalised bags of words of the templates.
-        descriptors: (M, d) projected descriptors of the valid patches of all templates.
+        descriptors: (M, d) projected descriptors of the valid patches of all templates; may be float16, for storage.
         points_model: (M, 3) their 3D points, mesh units.
         patch_index: (M,) int, cell ``row * grid + column`` of each patch in its template.
         template_offsets: (T + 1,) int64; template t owns patches ``offsets[t]`` to ``offsets[t + 1]``.
@@ -134,6 +135,8 @@ class ObjectRepresentation(nn.Module):
     def gather_templates(self, index: Tensor) -> TemplatePatches:
         """Patches of templates: any shape of template indices (...) → (..., Q, ·), Q the largest template's count.
 
+        Descriptors come in the type of the projection's components, whatever type they are stored in.
+
         Differentiable w.r.t. the buffers ``descriptors`` and ``points_model``.
         """
         start = self.template_offsets[index]
@@ -142,7 +145,9 @@ class ObjectRepresentation(nn.Module):
         valid = position < count.unsqueeze(-1)
         rows = torch.where(valid, start.unsqueeze(-1) + position, torch.zeros_like(position))
         keep = valid.unsqueeze(-1)
-        descriptors = torch.where(keep, self.descriptors[rows], self.descriptors.new_zeros(()))
+        # Converted after the gather: all of them in float32 would undo what half precision saves.
+        gathered = self.descriptors[rows].to(self.projection.components.dtype)
+        descriptors = torch.where(keep, gathered, gathered.new_zeros(()))
         points_model = torch.where(keep, self.points_model[rows], self.points_model.new_zeros(()))
         cell = self.patch_index[rows].long()
         columns_rows = torch.stack([cell % self.info.grid, cell // self.info.grid], dim=-1)
@@ -150,9 +155,14 @@ class ObjectRepresentation(nn.Module):
         return TemplatePatches(descriptors, points_model, pixels, valid)
 
     def memory_bytes(self) -> dict[str, int]:
-        """Bytes taken by each part, and their ``total``."""
-        parts = {name: tensor.numel() * tensor.element_size() for name, tensor in self.state_dict().items()}
-        return parts | {"total": sum(parts.values())}
+        """Bytes taken by each part, and their ``total``.
+
+        The parts are the buffers' names (``descriptors``, ``template_bow``, ``points_model``, …) and ``projection``.
+        """
+        parts: Counter[str] = Counter()
+        for name, tensor in self.state_dict().items():
+            parts[name.split(".")[0]] += tensor.numel() * tensor.element_size()
+        return dict(parts) | {"total": parts.total()}
 
     def check_extractor(self, fingerprint: Fingerprint) -> None:
         """Refuse an extractor whose descriptors cannot be compared with this representation's.

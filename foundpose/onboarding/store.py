@@ -4,8 +4,11 @@ import hashlib
 import json
 from pathlib import Path
 
-from foundpose.onboarding.onboarder import Onboarder, Progress
+from foundpose.onboarding.artefacts import ArtefactStore, load_or_make
+from foundpose.onboarding.cached import CachedOnboarding
+from foundpose.onboarding.onboarder import Onboarder
 from foundpose.onboarding.representation import SCHEMA_VERSION, ObjectRepresentation
+from foundpose.onboarding.stages import Progress
 from foundpose.rendering import Mesh
 
 
@@ -13,17 +16,25 @@ class RepresentationStore:
     """Keeps representations on disk, one file for each object and way of onboarding it.
 
     A file's name carries a hash of the mesh, the extractor and all settings that the representation depends on,
-    so other settings never meet an old file. Files are written whole or not at all.
+    so other settings never meet an old file. Files are written whole or not at all, and of several processes that ask
+    for the same object at once a single one onboards it.
 
     Args:
         folder: where the files lie; made when needed.
         onboarder: makes what is missing.
+        artefacts: keeps what the stages of onboarding made, for representations that share some of the settings;
+            None keeps nothing.
     """
 
-    def __init__(self, folder: str | Path, onboarder: Onboarder) -> None:
+    def __init__(
+        self, folder: str | Path, onboarder: Onboarder, artefacts: ArtefactStore | None = None
+    ) -> None:
         self.folder = Path(folder)
         self.onboarder = onboarder
         self._fingerprint = onboarder.extractor.fingerprint()
+        self._make: Onboarder | CachedOnboarding = onboarder
+        if artefacts is not None:
+            self._make = CachedOnboarding(onboarder, artefacts, self._fingerprint)
 
     def path(self, mesh: Mesh, name: str) -> Path:
         """File of an object under the onboarder's settings, whether it exists or not."""
@@ -41,10 +52,19 @@ class RepresentationStore:
         return self.path(mesh, name).is_file()
 
     def get(self, mesh: Mesh, name: str, progress: Progress | None = None) -> ObjectRepresentation:
-        """Load the object's representation, or onboard the object and save it."""
-        path = self.path(mesh, name)
-        if not path.is_file():
-            self.onboarder(mesh, name, progress).save(path)
-        representation = ObjectRepresentation.load(path)
+        """Load the object's representation, or onboard the object and save it; a broken file is made again."""
+        representation = load_or_make(
+            self.path(mesh, name),
+            _load,
+            lambda path: self._make(mesh, name, progress).save(path),
+        )
         representation.check_extractor(self._fingerprint)
         return representation
+
+
+def _load(path: Path) -> ObjectRepresentation | None:
+    """A representation; None where the file is missing or broken."""
+    try:
+        return ObjectRepresentation.load(path)
+    except (FileNotFoundError, ValueError):
+        return None

@@ -6,6 +6,7 @@ from foundpose.pnp.p3p import P3PSolutions, solve_p3p
 from foundpose.pnp.polish import polish_pnp
 from foundpose.pnp.ransac import PnpResult, PnpStatus, RansacPnp
 from foundpose.pnp.soft_selection import PoseCandidates, SoftInlierSelection
+from foundpose.pnp.template_pose import TemplatePoses, TopTemplatePose
 
 __all__ = [
     "GaussNewtonPnp",
@@ -17,6 +18,8 @@ __all__ = [
     "PoseCandidates",
     "RansacPnp",
     "SoftInlierSelection",
+    "TemplatePoses",
+    "TopTemplatePose",
     "polish_pnp",
     "solve_epnp",
     "solve_p3p",

@@ -97,16 +97,22 @@ class Renderer(nn.Module, ABC):
     """Renders a mesh from a batch of cameras; subclasses decide which face each sample sees.
 
     The light is fixed to the camera: ``ambient`` from everywhere, the rest along the optical axis, on both
-    sides of a face alike. Background is black.
+    sides of a face alike. Background is black. ``repr`` must show all settings that change the pictures: it names
+    what is kept of them on disk.
 
     Args:
         supersampling: n; colours are the mean of n × n regular samples per pixel. Depth, mask and normals are
             those of the pixel centre.
         ambient: share of ambient light in [0, 1].
 
+    Attributes:
+        bits: 8 or 16, to which onboarding rounds the colours of templates. A camera has 8.
+
     Raises:
         ValueError: an argument out of range.
     """
+
+    bits: int = 8
 
     def __init__(self, supersampling: int = 2, ambient: float = AMBIENT) -> None:
         super().__init__()

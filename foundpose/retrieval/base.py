@@ -1,8 +1,10 @@
-"""What retrieval receives and returns."""
+"""What retrieval receives and returns, and the contract of retrievers."""
 
+from abc import ABC, abstractmethod
 from typing import NamedTuple, Protocol
 
-from torch import Tensor
+import torch
+from torch import Tensor, nn
 
 
 class QueryPatches(NamedTuple):
@@ -22,17 +24,25 @@ class QueryPatches(NamedTuple):
 
 
 class TemplateIndex(Protocol):
-    """What a retriever reads of an object representation (all buffers on one device).
+    """What retrievers read of an object representation (all buffers on one device); none reads all of it.
 
     Attributes:
         words: (k, d) visual words.
         idf: (k,) inverse document frequencies, ``log(N / n_i)``.
         template_bow: (T, k) bag-of-words descriptors of the templates, L2-normalised.
+        template_cls: (T, C) raw global descriptors of the templates, or None.
+        descriptors: (M, d) projected descriptors of the patches of all templates, one template after another.
+        template_offsets: (T + 1,) int64; template t owns patches ``offsets[t]`` to ``offsets[t + 1]``.
+        max_patches: number of patches of the largest template.
     """
 
     words: Tensor
     idf: Tensor
     template_bow: Tensor
+    template_cls: Tensor | None
+    descriptors: Tensor
+    template_offsets: Tensor
+    max_patches: int
 
 
 class RetrievedTemplates(NamedTuple):
@@ -47,3 +57,77 @@ class RetrievedTemplates(NamedTuple):
     index: Tensor  # type: ignore[assignment]  # hides tuple.index
     similarity: Tensor
     valid: Tensor
+
+
+class Retriever(nn.Module, ABC):
+    """Finds the templates of an object that look most like a crop.
+
+    A crop's answer does not depend on the other crops of the batch. Whatever has the same ``forward`` can take a
+    retriever's place in :class:`foundpose.FoundPose`; a subclass can also say what it relies on.
+
+    Args:
+        num_templates: number h of templates per crop.
+    """
+
+    def __init__(self, num_templates: int = 5) -> None:
+        super().__init__()
+        if num_templates < 1:
+            raise ValueError(f"num_templates must be at least 1, got {num_templates}")
+        self.num_templates = num_templates
+
+    @abstractmethod
+    def forward(self, query: QueryPatches, index: TemplateIndex) -> RetrievedTemplates:
+        """Rank the templates of one object for a batch of crops.
+
+        Args:
+            query: patches of B crops.
+            index: templates of the object.
+
+        Returns:
+            The h most similar templates of each crop; a crop without valid patches has none.
+        """
+
+    def onboarding_settings(self) -> dict[str, str]:
+        """Settings that objects should have been onboarded with, by their names in ``Onboarder.settings``."""
+        return {}
+
+    def extra_repr(self) -> str:
+        """Settings, for printing."""
+        return f"num_templates={self.num_templates}"
+
+
+def normalize_rows(x: Tensor) -> Tensor:
+    """Scale the rows of (..., k) to unit length; zero rows stay zero.
+
+    Differentiable w.r.t. ``x``; a zero row, which has no direction, has gradient zero.
+    """
+    norm = torch.linalg.vector_norm(x, dim=-1, keepdim=True)
+    return x / norm.where(norm > 0, torch.inf)
+
+
+def select_templates(similarity: Tensor, valid: Tensor, num_templates: int) -> RetrievedTemplates:
+    """Keep the most similar templates; of equal ones, those with lower indices.
+
+    Args:
+        similarity: (B, T) similarity of each crop to each template; −inf for templates never to be kept.
+        valid: (B,) bool, False for crops of which nothing is known.
+        num_templates: number h of templates to keep.
+
+    Returns:
+        (B, h) templates, best first; padded with index 0 where fewer than h can be kept.
+
+    Differentiable w.r.t. ``similarity`` through the similarities kept; the choice of templates is constant.
+    """
+    kept = min(num_templates, similarity.shape[1])
+    # topk leaves the order of equal values open, a stable sort does not.
+    order = similarity.detach().sort(dim=1, descending=True, stable=True).indices[:, :kept]
+    best = similarity.gather(1, order)
+    ok = valid.unsqueeze(1) & (best > -torch.inf)
+    best = best.masked_fill(~ok, -torch.inf)
+    order = order.masked_fill(~ok, 0)
+    padding = (0, num_templates - kept)
+    return RetrievedTemplates(
+        index=nn.functional.pad(order, padding),
+        similarity=nn.functional.pad(best, padding, value=-torch.inf),
+        valid=nn.functional.pad(ok, padding, value=False),
+    )

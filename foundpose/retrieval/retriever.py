@@ -1,52 +1,18 @@
-"""Retrieval of the templates that look most like a crop."""
+"""Retrieval of the templates that look most like a crop, by one descriptor for each."""
 
-import torch
-from torch import Tensor, nn
-
-from foundpose.retrieval.base import QueryPatches, RetrievedTemplates, TemplateIndex
+from foundpose.retrieval.base import (
+    QueryPatches,
+    RetrievedTemplates,
+    Retriever,
+    TemplateIndex,
+    normalize_rows,
+    select_templates,
+)
 from foundpose.retrieval.bow import SoftAssignBow
 
 
-def normalize_rows(x: Tensor) -> Tensor:
-    """Scale the rows of (..., k) to unit length; zero rows stay zero.
-
-    Differentiable w.r.t. ``x``; a zero row, which has no direction, has gradient zero.
-    """
-    norm = torch.linalg.vector_norm(x, dim=-1, keepdim=True)
-    return x / norm.where(norm > 0, torch.inf)
-
-
-def select_templates(similarity: Tensor, valid: Tensor, num_templates: int) -> RetrievedTemplates:
-    """Keep the most similar templates; of equal ones, those with lower indices.
-
-    Args:
-        similarity: (B, T) similarity of each crop to each template.
-        valid: (B,) bool, False for crops of which nothing is known.
-        num_templates: number h of templates to keep.
-
-    Returns:
-        (B, h) templates, best first; padded with index 0 where h > T.
-
-    Differentiable w.r.t. ``similarity`` through the similarities kept; the choice of templates is constant.
-    """
-    kept = min(num_templates, similarity.shape[1])
-    # topk leaves the order of equal values open, a stable sort does not.
-    order = similarity.detach().sort(dim=1, descending=True, stable=True).indices[:, :kept]
-    ok = valid.unsqueeze(1).expand_as(order)
-    best = similarity.gather(1, order).masked_fill(~ok, -torch.inf)
-    order = order.masked_fill(~ok, 0)
-    padding = (0, num_templates - kept)
-    return RetrievedTemplates(
-        index=nn.functional.pad(order, padding),
-        similarity=nn.functional.pad(best, padding, value=-torch.inf),
-        valid=nn.functional.pad(ok, padding, value=False),
-    )
-
-
-class TemplateRetriever(nn.Module):
+class TemplateRetriever(Retriever):
     """Retrieves templates by the cosine similarity of bag-of-words descriptors.
-
-    Other retrievers take its place by having the same ``forward``.
 
     Args:
         bow: the descriptor; use the one that made the templates' descriptors.
@@ -56,11 +22,8 @@ class TemplateRetriever(nn.Module):
     """
 
     def __init__(self, bow: SoftAssignBow, num_templates: int = 5) -> None:
-        super().__init__()
-        if num_templates < 1:
-            raise ValueError(f"num_templates must be at least 1, got {num_templates}")
+        super().__init__(num_templates)
         self.bow = bow
-        self.num_templates = num_templates
 
     def forward(self, query: QueryPatches, index: TemplateIndex) -> RetrievedTemplates:
         """Rank the templates of one object for a batch of crops.
@@ -87,6 +50,50 @@ class TemplateRetriever(nn.Module):
         similarity = normalize_rows(vectors) @ index.template_bow.T
         return select_templates(similarity, query.valid.any(dim=1), self.num_templates)
 
-    def extra_repr(self) -> str:
-        """Settings, for printing."""
-        return f"num_templates={self.num_templates}"
+    def onboarding_settings(self) -> dict[str, str]:
+        """The bag of words: its settings shape the templates' descriptors."""
+        return {"bow": repr(self.bow)}
+
+
+class ClsRetriever(Retriever):
+    """Retrieves templates by the cosine similarity of the extractor's global (cls) tokens.
+
+    The token sees the background too: ``PerspectiveCrop(background="black")`` hides it, as templates have none.
+
+    Args:
+        num_templates: number h of templates per crop.
+
+    Source: paper, "Template retrieval", and Table 2, rows 8 and 9.
+    """
+
+    def forward(self, query: QueryPatches, index: TemplateIndex) -> RetrievedTemplates:
+        """Rank the templates of one object for a batch of crops.
+
+        Args:
+            query: global descriptors of B crops.
+            index: global descriptors of the object's templates.
+
+        Returns:
+            The h most similar templates of each crop; a crop without valid patches has none, as no other retriever
+            has any for it.
+
+        Raises:
+            ValueError: the extractor or the object has no global descriptors, or they differ in length.
+
+        Differentiable w.r.t. ``query.cls`` and ``index.template_cls`` through ``similarity``; the choice of templates
+        is constant.
+        """
+        if query.cls is None or index.template_cls is None:
+            whose = "the extractor gives" if query.cls is None else "the object's templates have"
+            raise ValueError(
+                f"{whose} no cls token: retrieve by bags of words or patch votes (retrieval=bag_of_words or "
+                "retrieval=patch_votes), or use a vision transformer that has a cls token"
+            )
+        templates = index.template_cls.to(query.cls)
+        if templates.ndim != 2 or query.cls.ndim != 2 or templates.shape[1] != query.cls.shape[1]:
+            raise ValueError(
+                "query.cls and template_cls must have shapes (B, C) and (T, C), got "
+                f"{tuple(query.cls.shape)} and {tuple(templates.shape)}"
+            )
+        similarity = normalize_rows(query.cls) @ normalize_rows(templates).T
+        return select_templates(similarity, query.valid.any(dim=1), self.num_templates)

@@ -15,7 +15,7 @@ from foundpose.losses.reduction import mean_norm, place_points
 from foundpose.onboarding import ObjectRepresentation, Progress
 from foundpose.pipeline import FoundPose
 from foundpose.rendering import Mesh, Renderer
-from foundpose.retrieval import QueryPatches, RetrievedTemplates, TemplateRetriever
+from foundpose.retrieval import QueryPatches, RetrievedTemplates
 from foundpose.retrieval.base import TemplateIndex
 from foundpose.synthetic import LightVariation, cluttered_scene
 
@@ -43,16 +43,12 @@ class PoseErrors(NamedTuple):
 class GivenTemplates(nn.Module):
     """Takes a retriever's place and returns the templates that it was told to.
 
-    Args:
-        retriever: whose place it takes.
-
     Attributes:
         index: (B, h) templates of the next batch of crops.
     """
 
-    def __init__(self, retriever: TemplateRetriever) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.bow = retriever.bow
         self.index = torch.zeros(0, 1, dtype=torch.int64)
 
     def forward(self, query: QueryPatches, index: TemplateIndex) -> RetrievedTemplates:
@@ -95,7 +91,7 @@ def evaluate_scenes(
         Errors with the "retrieved" templates, and with the "nearest" one given, which leaves out retrieval.
     """
     with _eval_mode(pipeline):
-        given = GivenTemplates(pipeline.retriever)
+        given = GivenTemplates()
         told = FoundPose(
             pipeline.crop,
             pipeline.extractor,

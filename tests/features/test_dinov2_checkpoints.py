@@ -4,12 +4,12 @@ import torch
 from foundpose.features.dinov2 import DinoV2
 from foundpose.features.dinov2_checkpoints import (
     VARIANTS,
-    WeightsNotFoundError,
     build_config,
     hub_repository,
     model_class,
     original_checkpoint_url,
 )
+from foundpose.features.weights import WeightsNotFoundError
 from tests.features import original_dinov2
 
 SIZES = {"hidden_size": 32, "num_hidden_layers": 4, "num_attention_heads": 4, "image_size": 70}

@@ -272,3 +272,51 @@ def test_bad_input_is_named(change, message):
         PerspectiveCrop(size=14)(**(arguments | change))
     with pytest.raises(ValueError, match="fill"):
         PerspectiveCrop(fill=1.5)
+    with pytest.raises(ValueError, match=r"background must be one of \('keep', 'black'\), got 'white'"):
+        PerspectiveCrop(background="white")
+
+
+def test_black_background_hides_what_is_outside_the_mask_and_nothing_else():
+    g = torch.Generator().manual_seed(5)
+    image = 0.1 + 0.9 * torch.rand(1, 3, 120, 160, generator=g)
+    K = intrinsics_matrix(200.0, 200.0, 79.5, 59.5)[None]
+    masks = torch.stack([disc_mask(120, 160, 100, 60, 15), disc_mask(120, 160, 20, 40, 40)])
+    index = torch.zeros(2, dtype=torch.int64)
+    kept = PerspectiveCrop(size=84)(image, K, masks, image_index=index)
+    black = PerspectiveCrop(size=84, background="black")(image, K, masks, image_index=index)
+    for name in ("masks", "K_crop", "T_crop_from_camera", "boxes", "valid"):
+        assert torch.equal(getattr(kept, name), getattr(black, name)), name
+    inside = (kept.masks > 0.5)[:, None].expand_as(kept.images)
+    assert 0.1 < inside.float().mean() < 0.5
+    assert torch.equal(black.images[inside], kept.images[inside])
+    assert (black.images[~inside] == 0).all()
+    assert (kept.images[~inside] > 0).any()
+
+
+def test_black_background_of_boxes_and_of_unusable_masks():
+    image = torch.full((1, 3, 60, 60), 0.5)
+    K = intrinsics_matrix(100.0, 100.0, 29.5, 29.5)[None]
+    module = PerspectiveCrop(size=50, fill=0.6, antialias=False, background="black")
+    box = torch.tensor([[14.5, 14.5, 44.5, 44.5]])
+    crops = module(image, K, boxes=box)
+    # 30 pixels across, on the axis: 30 pixels in the crop.
+    expected = torch.zeros(50, 50)
+    expected[10:40, 10:40] = 0.5
+    torch.testing.assert_close(crops.images[0], expected.expand(3, 50, 50))
+    empty = module(image, K, torch.zeros(1, 60, 60))
+    assert not empty.valid[0]
+    assert (empty.images == 0).all()
+
+
+def test_gradient_of_a_black_background_is_that_of_what_is_inside():
+    image = torch.rand(1, 3, 40, 40, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    image.requires_grad_()
+    K = intrinsics_matrix(60.0, 60.0, 19.5, 19.5).double()[None]
+    mask = disc_mask(40, 40, 20, 20, 8)[None]
+    crops = {b: PerspectiveCrop(size=30, background=b)(image, K, mask) for b in ("keep", "black")}
+    weight = torch.rand(3, 30, 30, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
+    inside = crops["keep"].masks > 0.5
+    (expected,) = torch.autograd.grad((crops["keep"].images * weight * inside).sum(), image)
+    (gradient,) = torch.autograd.grad((crops["black"].images * weight).sum(), image)
+    assert expected.abs().max() > 0
+    torch.testing.assert_close(gradient, expected)

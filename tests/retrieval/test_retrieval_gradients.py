@@ -164,7 +164,7 @@ def representation() -> ObjectRepresentation:
     """Four templates with 2, 0, 3 and 1 patches."""
     info = RepresentationInfo("toy", 1.0, "", {}, image_size=56, stride=14.0, offset=6.5, grid=4)
     return ObjectRepresentation(
-        PcaProjection(2),
+        PcaProjection(2).double(),
         words=randn(5, 2, seed=0),
         idf=torch.ones(5).double(),
         template_bow=torch.ones(4, 5).double(),

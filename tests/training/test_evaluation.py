@@ -141,8 +141,8 @@ def test_scenes_with_retrieved_and_with_nearest_templates(bodies, sift_onboarder
         assert (forgiving[mode].matching <= errors[mode].matching + 0.01).all()
 
 
-def test_given_templates(sift_onboarder):
-    given = GivenTemplates(TemplateRetriever(sift_onboarder.bow))
+def test_given_templates():
+    given = GivenTemplates()
     valid = torch.tensor([[True, False], [False, False]])
     query = QueryPatches(torch.zeros(2, 2, 4), torch.zeros(2, 2, 2), valid)
     with pytest.raises(ValueError, match="given for 0 crops, there are 2"):

@@ -1,0 +1,22 @@
+"""Ablations: rows of the paper's tables and sweeps, each set of settings evaluated once.
+
+python experiments/ablate.py experiment=table2_row03 data=lmo
+python experiments/ablate.py -m sweep=words extractor=dense_sift data=lmo
+python experiments/ablate.py -m sweep=table2 data=lmo,tless,tudl launcher=slurm
+"""
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from foundpose.ablation import run_once
+
+
+@hydra.main(version_base="1.3", config_path="../conf", config_name="ablate")
+def main(cfg: DictConfig) -> None:
+    """Evaluate one set of settings; the report over all runs follows when the last one is done."""
+    run_once(cfg, HydraConfig.get().runtime.choices.get("experiment"))
+
+
+if __name__ == "__main__":
+    main()

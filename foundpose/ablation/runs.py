@@ -1,0 +1,222 @@
+"""Runs one set of settings of a sweep, once, and reports on all that ran: the part of this room that knows Hydra."""
+
+import hashlib
+import json
+import sys
+import traceback
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig, OmegaConf
+
+from foundpose.ablation.memory import memory_table
+from foundpose.ablation.plots import plot_sweep
+from foundpose.ablation.records import RUN_FILE, RunRecord, collect_runs, varied_settings, write_tidy
+from foundpose.ablation.sweeps import SWEEP_FIGURES, sweep_table
+from foundpose.ablation.tables import paper_table
+from foundpose.ablation.text_tables import Format
+from foundpose.io import write_atomically
+
+# Keys that say where things lie and what they are called, not what is computed.
+_NOT_SETTINGS = ("folder", "representations", "artefacts", "results", "method", "row")
+_FORMATS: tuple[tuple[str, Format], ...] = ((".md", "markdown"), (".tex", "latex"))
+_NOT_VARIED = ("masks.path", "data.root")
+
+
+def run_settings(cfg: DictConfig) -> dict[str, Any]:
+    """What a run depends on: values by dotted key.
+
+    Nodes that only repeat another one (``${words}``) are left out, and so are places and names.
+    """
+    literal = OmegaConf.to_container(cfg, resolve=False)
+    resolved = OmegaConf.to_container(cfg, resolve=True)
+    assert isinstance(literal, dict)
+    assert isinstance(resolved, dict)
+    settings: dict[str, Any] = {}
+
+    def collect(literal: Any, resolved: Any, key: str) -> None:
+        if isinstance(literal, str) and literal.startswith("${") and not literal.startswith("${oc."):
+            return
+        if isinstance(literal, dict) and literal:
+            for name, value in literal.items():
+                collect(value, resolved[name], f"{key}.{name}" if key else str(name))
+        else:
+            settings[key] = resolved
+
+    for name, value in literal.items():
+        if name not in _NOT_SETTINGS:
+            collect(value, resolved[name], str(name))
+    return settings
+
+
+def run_folder(cfg: DictConfig, name: str | None) -> Path:
+    """Folder of a run below ``cfg.folder``: the same for the same settings, whatever they were called."""
+    # How many processes share the work, and on what, changes no result.
+    kept = {
+        k: v for k, v in run_settings(cfg).items() if k.split(".")[0] not in ("trainer", "device", "errors")
+    }
+    digest = hashlib.sha256(json.dumps(kept, sort_keys=True, default=str).encode()).hexdigest()[:12]
+    return Path(cfg.folder) / "runs" / f"{_dataset(cfg)}-{name or 'run'}-{digest}"
+
+
+def run_once(cfg: DictConfig, name: str | None = None) -> RunRecord:
+    """Evaluate one set of settings unless that has been done, and record it.
+
+    Args:
+        cfg: as ``conf/ablate.yaml``.
+        name: of the experiment, for the record and the folder.
+
+    Returns:
+        The record, which lies in the run's folder as ``run.json``. A run that fails is recorded too, with its error
+        (``error.txt`` has the whole of it), and is tried again the next time, from where it stopped.
+    """
+    from foundpose.evaluation import run_evaluation  # Lightning takes its time; reports do without
+
+    folder = run_folder(cfg, name)
+    if (folder / RUN_FILE).is_file():
+        before = RunRecord.read(folder / RUN_FILE)
+        if before.status == "finished":
+            print(f"already there: {folder}")
+            return before
+    facts: dict[str, Any] = {
+        "name": name,
+        "row": cfg.row,
+        "dataset": _dataset(cfg),
+        "label": _label(cfg),
+        "settings": run_settings(cfg),
+    }
+    try:
+        run_evaluation(cfg, folder)
+        record = RunRecord(**facts, status="finished", figures=_figures(folder))
+        (folder / "error.txt").unlink(missing_ok=True)
+    except Exception as error:
+        text = traceback.format_exc()
+        write_atomically(folder / "error.txt", lambda temporary: temporary.write_text(text))
+        cause = _root_cause(error)
+        record = RunRecord(**facts, status="failed", error=f"{type(cause).__name__}: {cause}")
+        print(f"failed: {folder}: {record.error}", file=sys.stderr)
+    record.write(folder)
+    return record
+
+
+def _dataset(cfg: DictConfig) -> str:
+    return Path(str(cfg.data.root)).expanduser().resolve().name
+
+
+def _label(cfg: DictConfig) -> str | None:
+    """Why a run's figures mean nothing, if so."""
+    if cfg.extractor.get("weights") == "random":
+        return "random weights: the figures mean nothing"
+    return None
+
+
+def _root_cause(error: BaseException) -> BaseException:
+    """What Hydra's instantiation wraps."""
+    while error.__cause__ is not None:
+        error = error.__cause__
+    return error
+
+
+def _figures(folder: Path) -> dict[str, Any]:
+    """Scores, times and memory of a finished evaluation."""
+    scores, timing, memory = (
+        json.loads((folder / f"{name}.json").read_text()) for name in ("scores", "timing", "memory")
+    )
+    figures = {name: scores.get(name) for name in ("AR", "AR_VSD", "AR_MSSD", "AR_MSPD", "targets")}
+    figures["time_per_image"] = scores.get("average_time_per_image")
+    figures |= {f"seconds_per_instance.{k}": v for k, v in timing["seconds_per_instance"].items()}
+    parts: dict[str, list[int]] = defaultdict(list)
+    for sizes in memory.values():
+        for part, size in sizes.items():
+            parts[part].append(size)
+    # Of one object, on average.
+    return figures | {f"memory.{part}": sum(sizes) / len(memory) for part, sizes in parts.items()}
+
+
+def write_reports(folder: str | Path) -> list[RunRecord]:
+    """Write results.csv, the paper's tables, and a table and plots of every setting that was varied on its own.
+
+    Args:
+        folder: ``folder`` of ``conf/ablate.yaml``; ``runs`` in it is read, ``tables`` and ``plots`` are written.
+
+    Returns:
+        All runs found.
+    """
+    folder = Path(folder)
+    records = collect_runs(folder / "runs") if (folder / "runs").is_dir() else []
+    if not records:
+        return records
+    write_tidy(records, folder / "results.csv")
+    tables: dict[str, str] = {}
+    for suffix, format in _FORMATS:
+        for number in (1, 2):
+            tables[f"table{number}{suffix}"] = paper_table(records, number, format)
+        tables[f"memory{suffix}"] = memory_table(records, format)
+    finished = [record for record in records if record.status == "finished"]
+    for key in varied_settings(finished):
+        if key in _NOT_VARIED or key.endswith("_target_"):
+            continue
+        runs = [run for group in varied_alone(finished, key) for run in group]
+        if not runs:
+            continue
+        series = [k for k in varied_settings(runs) if k != key and not k.endswith("_target_")]
+        for suffix, format in _FORMATS:
+            tables[f"sweep_{key.replace('.', '_')}{suffix}"] = sweep_table(
+                runs, [*series, key], format=format
+            )
+        figures = [
+            f for f in SWEEP_FIGURES if any(run.counts and run.figures.get(f) is not None for run in runs)
+        ]
+        if figures:
+            plot_sweep(runs, key, figures, folder / "plots" / key.replace(".", "_"), _series_key(runs, key))
+    for name, text in tables.items():
+        _write_text(folder / "tables" / name, text)
+    return records
+
+
+def varied_alone(records: Sequence[RunRecord], key: str) -> list[list[RunRecord]]:
+    """Groups of runs that differ in one setting and nothing else, with at least two values of it."""
+    groups: dict[str, list[RunRecord]] = defaultdict(list)
+    for record in records:
+        rest = {k: v for k, v in record.settings.items() if k != key}
+        groups[json.dumps([record.dataset, rest], sort_keys=True, default=str)].append(record)
+    return [
+        group for group in groups.values() if len({json.dumps(run.settings.get(key)) for run in group}) > 1
+    ]
+
+
+class SweepReport(Callback):
+    """Writes the reports when a run or a sweep is over, and lists what failed; the app then ends with status 1."""
+
+    def on_run_end(self, config: DictConfig, **kwargs: Any) -> None:
+        """After a single run."""
+        self._report(config)
+
+    def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
+        """After a sweep."""
+        self._report(config)
+
+    def _report(self, config: DictConfig) -> None:
+        records = write_reports(config.folder)
+        failed = [record for record in records if record.status == "failed"]
+        print(f"{len(records) - len(failed)} runs finished, {len(failed)} failed; see {config.folder}")
+        for record in failed:
+            print(f"failed: {record.folder}: {record.error}", file=sys.stderr)
+        if failed:
+            sys.exit(1)
+
+
+def _series_key(runs: Sequence[RunRecord], key: str) -> str | None:
+    """What tells the lines of a plot apart: the extractor where there are several."""
+    varied = varied_settings(runs)
+    for candidate in ("extractor._target_", *varied):
+        if candidate in varied and candidate != key:
+            return candidate
+    return "dataset" if len({run.dataset for run in runs}) > 1 else None
+
+
+def _write_text(path: Path, text: str) -> None:
+    write_atomically(path, lambda temporary: temporary.write_text(text))

@@ -1,0 +1,154 @@
+"""An evaluation from its Hydra config: what the apps that evaluate share."""
+
+import logging
+import warnings
+from pathlib import Path
+
+import pytorch_lightning as pl
+from hydra.utils import instantiate
+from omegaconf import DictConfig
+
+from foundpose.bop import (
+    BopDataset,
+    PoseResult,
+    Scores,
+    Target,
+    check_functions,
+    read_results,
+    result_file_name,
+    score_results,
+    write_results,
+)
+from foundpose.config import build_method, claim_run_folder, wanted_objects
+from foundpose.evaluation.data import PoseDataModule
+from foundpose.evaluation.module import PoseEvaluation, estimate_dataset
+from foundpose.evaluation.report import all_records, merge_shards, timing
+from foundpose.io import write_json
+from foundpose.objects import DatasetObjects
+from foundpose.progress import ProgressBars
+from foundpose.records import best_results, to_results
+
+# Settings that may change when a run is resumed: they change no pose.
+MAY_CHANGE = (
+    "device",
+    "trainer",
+    "errors",
+    "memory_limit",
+    "representations",
+    "artefacts",
+    "data_module.num_workers",
+    "data_module.prepare_data_per_node",
+    "evaluation.time_stages",
+)
+
+
+def run_evaluation(cfg: DictConfig, output: Path) -> Scores | None:
+    """Estimate what is not estimated yet, then write results, scores and times to the run's folder.
+
+    With ``cfg.results`` the poses of that file are scored instead.
+
+    Args:
+        cfg: as ``conf/evaluate.yaml``.
+        output: the run's folder; in a run of several processes each gets it, and the first writes the results.
+
+    Returns:
+        The scores; None in all processes but the first, and for a split without ground truth.
+
+    Raises:
+        ValueError: settings or files that make no sense; the message says which.
+        FileNotFoundError: a missing file.
+    """
+    check_functions(list(cfg.errors))
+    dataset: BopDataset = instantiate(cfg.data)
+    wanted = wanted_objects(cfg, dataset)
+    if cfg.results is not None:
+        results = read_results(cfg.results)
+    else:
+        estimated = _estimate(cfg, dataset, wanted, output)
+        if estimated is None:
+            return None
+        results = estimated
+    return _score(cfg, dataset, results, wanted, output)
+
+
+def _estimate(
+    cfg: DictConfig, dataset: BopDataset, wanted: list[int], output: Path
+) -> list[PoseResult] | None:
+    """The poses that are handed in, in the first process; None in the others."""
+    masks = instantiate(cfg.masks)
+    method = build_method(cfg)
+    objects = DatasetObjects(dataset, method.store, cfg.memory_limit)
+    data: PoseDataModule = instantiate(
+        cfg.data_module,
+        dataset=dataset,
+        masks=masks,
+        objects=objects,
+        folder=output,
+        pictures=instantiate(cfg.pictures),
+        object_ids=wanted,
+        max_images=cfg.max_images,
+    )
+    batches = data.batches
+    claim_run_folder(output, cfg, MAY_CHANGE)
+    logging.getLogger("pytorch_lightning.utilities.rank_zero").setLevel(logging.WARNING)
+    trainer: pl.Trainer = instantiate(cfg.trainer, default_root_dir=output)
+    module: PoseEvaluation = instantiate(
+        cfg.evaluation, pipeline=method.pipeline, objects=objects, folder=output
+    )
+    with warnings.catch_warnings():
+        # Reading is a small part of the time; num_workers is there for those who want it.
+        warnings.filterwarnings("ignore", message=".*does not have many workers.*")
+        warnings.filterwarnings("ignore", message=".*LeafSpec.*")  # Lightning's own
+        estimate_dataset(trainer, module, data)
+    if not trainer.is_global_zero:
+        return None
+
+    done = merge_shards(output, batches)
+    write_json(output / "timing.json", timing(done, trainer.strategy.root_device))
+    write_json(
+        output / "memory.json", memory(objects, sorted({i.obj_id for batch in batches for i in batch}))
+    )
+    records = all_records(done)
+    write_json(output / "estimates.json", records)
+    results = best_results(to_results(records), dataset.targets())
+    path = output / result_file_name(cfg.method, dataset.root.name, cfg.data.split)
+    write_results(path, results)
+    print(f"{len(records)} instances, {sum(r['valid'] for r in records)} with a pose; written to {path}")
+    return results
+
+
+def memory(objects: DatasetObjects, ids: list[int]) -> dict[str, dict[str, int]]:
+    """Bytes of the objects' representations by part, by object id."""
+    return {str(obj_id): objects.representations([obj_id])[0].memory_bytes() for obj_id in ids}
+
+
+def _score(
+    cfg: DictConfig, dataset: BopDataset, results: list[PoseResult], wanted: list[int], output: Path
+) -> Scores | None:
+    """Write scores.json and print the table; a split without ground truth has no scores."""
+    scenes = sorted({scene_id for scene_id, _ in dataset.images()})
+    without = [scene_id for scene_id in scenes if not dataset.has_ground_truth(scene_id)]
+    if without:
+        reason = f"{len(without)} of {len(scenes)} scenes in {dataset.split} have no scene_gt.json"
+        write_json(output / "scores.json", {"computed": False, "reason": reason})
+        print(f"no scores: {reason}")
+        return None
+    scores = score_results(
+        dataset,
+        results,
+        errors=tuple(cfg.errors),
+        targets=_targets(cfg, dataset, wanted),
+        progress=ProgressBars("score"),
+    )
+    write_json(output / "scores.json", scores.to_json())
+    print(scores.table())
+    return scores
+
+
+def _targets(cfg: DictConfig, dataset: BopDataset, wanted: list[int]) -> list[Target] | None:
+    """The part of the targets that a run is about; None for all."""
+    if cfg.objects is None and cfg.max_images is None:
+        return None
+    images = set(dataset.images()[: cfg.max_images])
+    targets = dataset.localization_targets()
+    return [t for t in targets if t.obj_id in wanted and (t.scene_id, t.im_id) in images]

@@ -1,0 +1,179 @@
+"""What the extractors that run a pretrained network have in common."""
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Self
+
+import torch
+from torch import Tensor, nn
+
+from foundpose.features.base import Fingerprint, PatchExtractor, PatchFeatures
+from foundpose.features.checks import check_images
+from foundpose.features.resample import on_grid, resize_images
+from foundpose.features.weights import (
+    ConfigValue,
+    Sizes,
+    check_layer,
+    check_seed,
+    resolve_variant,
+    weights_checksum,
+)
+
+PATCH_SIZE = 14
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
+_AUTOCAST = {"bf16": torch.bfloat16, "fp16": torch.float16}
+
+
+class PretrainedExtractor(PatchExtractor):
+    """Runs a network and puts its features on the grid of 14 px patches: 30 × 30 for a crop of 420 px.
+
+    The crop is resized to the side that suits the network (``input_size``), its values are normalised, and the
+    network's feature map is sampled at the patch centres where its own grid is another one. The network stays in
+    evaluation mode, also where the extractor is part of a model in training: batch statistics and random
+    augmentations of positions would make a descriptor depend on its neighbours in the batch.
+
+    Args:
+        model: the network.
+        channels: length C of a descriptor.
+        settings: what the fingerprint says besides the weights.
+        has_cls: whether ``describe`` gives a global descriptor.
+        precision: ``"bf16"`` or ``"fp16"`` runs the network under autocast; None in the weights' own precision.
+        mean: of the network's training images, per channel, for values in [0, 1].
+        std: their standard deviation.
+
+    Raises:
+        ValueError: unknown precision.
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(
+        self,
+        model: nn.Module,
+        channels: int,
+        settings: Fingerprint,
+        has_cls: bool,
+        precision: str | None,
+        mean: Sequence[float] = IMAGENET_MEAN,
+        std: Sequence[float] = IMAGENET_STD,
+    ) -> None:
+        super().__init__(channels, stride=PATCH_SIZE, offset=(PATCH_SIZE - 1) / 2)
+        self.model = model.eval()
+        self.settings = dict(settings)
+        self.has_cls = has_cls
+        self.precision = precision
+        self.register_buffer("mean", torch.tensor(mean).view(3, 1, 1), persistent=False)
+        self.register_buffer("std", torch.tensor(std).view(3, 1, 1), persistent=False)
+
+    @abstractmethod
+    def input_size(self, image_size: int) -> int:
+        """Side in pixels that images of ``image_size`` px are resized to for the network."""
+
+    @abstractmethod
+    def describe(self, pixels: Tensor) -> PatchFeatures:
+        """Run the network.
+
+        Args:
+            pixels: (B, 3, s, s) normalised RGB, s = ``input_size``, in the dtype of the weights.
+
+        Returns:
+            Features (B, C, m, m) whose cells tile the image, or (B, C, S/14, S/14) on the grid already, and the
+            global descriptor (B, C) or None.
+        """
+
+    def forward(self, images: Tensor) -> PatchFeatures:
+        """Describe the patches of images.
+
+        Args:
+            images: (B, 3, S, S) RGB in [0, 1]; S a multiple of 14 px.
+
+        Returns:
+            Patch descriptors (B, C, S/14, S/14) and the global descriptor (B, C) or None, in the dtype of
+            ``images``.
+
+        Raises:
+            ValueError: wrong shape, type, size or range of ``images``.
+
+        Differentiable w.r.t. ``images`` and the parameters.
+        """
+        check_images(images, multiple_of=PATCH_SIZE)
+        size = images.shape[-1]
+        n = size // PATCH_SIZE
+        if not len(images):  # transformers' attention cannot reshape an empty batch
+            cls = images.new_zeros(0, self.channels) if self.has_cls else None
+            return PatchFeatures(images.new_zeros(0, self.channels, n, n), cls)
+        # resized and normalised in at least single precision
+        pixels = images.to(torch.promote_types(images.dtype, self.mean.dtype))
+        pixels = (resize_images(pixels, self.input_size(size)) - self.mean) / self.std
+        pixels = pixels.to(next(self.model.parameters()).dtype)
+        autocast = _AUTOCAST.get(self.precision) if self.precision else None
+        with torch.autocast(images.device.type, dtype=autocast, enabled=autocast is not None):
+            patches, cls = self.describe(pixels)
+        cls = None if cls is None else cls.to(images.dtype)
+        return PatchFeatures(on_grid(patches, n).to(images.dtype), cls)
+
+    def fingerprint(self) -> Fingerprint:
+        """The settings and a checksum of the weights as they are now; not the precision.
+
+        Casting the weights (``half()``) changes their values and so the checksum; ``precision`` does not.
+        """
+        return {
+            "extractor": type(self).__name__,
+            **self.settings,
+            "weights": weights_checksum(self.model),
+        }
+
+    def train(self, mode: bool = True) -> Self:
+        """Set the mode of training of everything but the network, which stays in evaluation mode."""
+        super().train(mode)
+        self.model.eval()
+        return self
+
+    def extra_repr(self) -> str:
+        """Shown by ``print``."""
+        return ", ".join(f"{k}={v!r}" for k, v in {**self.settings, "precision": self.precision}.items())
+
+
+def check_precision(precision: str | None) -> None:
+    """Raise ValueError for a precision that is none of None, 'bf16' and 'fp16'."""
+    if precision is not None and precision not in _AUTOCAST:
+        raise ValueError(f"precision must be None, 'bf16' or 'fp16', got {precision!r}")
+
+
+def resolve_architecture(
+    variants: Mapping[str, Sizes],
+    variant: str,
+    config: Mapping[str, ConfigValue] | None,
+    layer: int,
+    weights: str | Path,
+    precision: str | None,
+    seed: int | None,
+) -> Sizes:
+    """Sizes of a transformer's variant, once its extractor's settings are seen to be good.
+
+    Args:
+        variants: sizes of all variants.
+        variant: the one asked for.
+        config: sizes that differ from the variant's.
+        layer: block whose output is taken, counted from 0.
+        weights: where they are, or ``"random"``.
+        precision: of the extractor.
+        seed: of random weights.
+
+    Raises:
+        ValueError: an unknown variant, size, layer or precision; a seed without random weights or the reverse.
+    """
+    sizes = resolve_variant(variants, variant, config)
+    check_layer(layer, sizes._asdict()["num_hidden_layers"], variant)
+    check_precision(precision)
+    check_seed(weights, seed)
+    return sizes
+
+
+def split_tokens(tokens: Tensor, num_prefix: int) -> PatchFeatures:
+    """Tokens (B, num_prefix + m², C) of a transformer, that of the class first, as a map (B, C, m, m) and cls."""
+    m = round((tokens.shape[1] - num_prefix) ** 0.5)
+    return PatchFeatures(tokens[:, num_prefix:].unflatten(1, (m, m)).permute(0, 3, 1, 2), tokens[:, 0])

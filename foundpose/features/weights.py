@@ -1,0 +1,225 @@
+"""Weights of pretrained backbones: finding, checking, loading and telling them apart."""
+
+import hashlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import torch
+from torch import Tensor, nn
+
+ConfigValue = int | float | bool | str | tuple[int, ...]
+Sizes = TypeVar("Sizes", bound=NamedTuple)
+
+
+class WeightsNotFoundError(FileNotFoundError):
+    """Weights are neither on this machine nor could they be fetched; the message says how to get them."""
+
+
+def resolve_variant(variants: Mapping[str, Sizes], variant: str, config: Mapping[str, Any] | None) -> Sizes:
+    """Sizes of a variant, with those of ``config`` in place of the variant's own.
+
+    Raises:
+        ValueError: unknown variant, or unknown keys in ``config``.
+    """
+    if variant not in variants:
+        raise ValueError(f"variant must be one of {', '.join(variants)}, got {variant!r}")
+    sizes = variants[variant]
+    unknown = set(config or {}) - set(sizes._fields)
+    if unknown:
+        raise ValueError(f"config has unknown keys {sorted(unknown)}; known: {sizes._fields}")
+    return sizes._replace(**{name: _plain(value) for name, value in (config or {}).items()})
+
+
+def check_layer(layer: int, depth: int, variant: str) -> None:
+    """Raise ValueError where a model of ``depth`` blocks has no block ``layer``."""
+    if not 0 <= layer < depth:
+        raise ValueError(f"layer must be in 0..{depth - 1} for {variant}, got {layer}")
+
+
+def check_seed(weights: str | Path, seed: int | None) -> None:
+    """Raise ValueError unless random weights come with a seed, and others without."""
+    if (weights == "random") != (seed is not None):
+        raise ValueError(f"weights='random' goes with a seed, got weights={weights!r} and seed={seed}")
+
+
+def check_sizes(
+    found: Mapping[str, Any], wanted: Mapping[str, Any], source: str, variants: Mapping[str, object]
+) -> None:
+    """Raise ValueError where weights have other sizes than the variant asked for."""
+    wrong = {name: _plain(value) for name, value in found.items() if _plain(value) != wanted[name]}
+    if wrong:
+        differences = ", ".join(f"{name} {value} instead of {wanted[name]}" for name, value in wrong.items())
+        raise ValueError(
+            f"the weights in {source} do not fit the variant asked for: {differences}; "
+            f"choose the variant that they belong to, one of {', '.join(variants)}"
+        )
+
+
+def how_to_get_hub_weights(variant: str, repository: str, before: str = "") -> str:
+    """Instructions for people, for error messages."""
+    return (
+        f"To get the weights of {variant}, on a machine with a network {before}run\n"
+        f"  hf download {repository} --local-dir DIR\n"
+        f"and pass weights=DIR"
+    )
+
+
+def load_transformers(
+    weights: str | Path,
+    repository: str,
+    model_class: Any,
+    config: Any,
+    sizes: NamedTuple,
+    variant: str,
+    variants: Mapping[str, object],
+    how: str,
+) -> nn.Module:
+    """Load a model of transformers from the hub, its cache, or a folder written by ``save_pretrained``.
+
+    Args:
+        weights: ``"hub"`` or a folder. Either may also hold a larger model that this one is a part of, as CLIP's
+            checkpoints hold its image encoder.
+        repository: on the hub.
+        model_class: class of transformers.
+        config: configuration of transformers for the model to build, possibly with fewer blocks.
+        sizes: what the whole model must have, names as in transformers' configurations.
+        variant: asked for, for messages.
+        variants: all there are, for messages.
+        how: instructions to get the weights.
+
+    Raises:
+        WeightsNotFoundError: no weights there.
+        ValueError: the weights are those of another model or variant, or incomplete.
+    """
+    from transformers import AutoConfig
+
+    # A path that is not there must not be taken for the name of a repository.
+    if weights != "hub" and not (Path(weights) / "config.json").is_file():
+        raise WeightsNotFoundError(f"no folder with weights in transformers' format at {weights}.\n{how}")
+    source = repository if weights == "hub" else str(weights)
+    try:
+        found = AutoConfig.from_pretrained(source)
+        whole = found.model_type
+        if whole != config.model_type and config.base_config_key:
+            found = getattr(found, config.base_config_key, found)
+        if found.model_type != config.model_type:
+            raise ValueError(
+                f"{source} holds a {whole!r} model, but variant {variant} is {config.model_type!r}"
+            )
+        check_sizes({n: getattr(found, n, 0) for n in sizes._fields}, sizes._asdict(), source, variants)
+        return build_transformers(model_class, config, source, None, source)
+    except OSError as error:
+        raise WeightsNotFoundError(f"could not load weights from {source}: {error}\n{how}") from error
+
+
+def build_transformers(
+    model_class: Any, config: Any, source: str | None, state: dict[str, Tensor] | None, origin: str
+) -> nn.Module:
+    """Build a model of transformers with the weights at ``source``, or with those in ``state``.
+
+    Raises:
+        OSError: nothing at ``source``.
+        ValueError: weights are missing or of the wrong shape.
+    """
+    with _quiet_transformers():
+        model, info = model_class.from_pretrained(
+            source,
+            config=config,
+            state_dict=state,
+            attn_implementation="sdpa",
+            dtype=torch.float32,
+            output_loading_info=True,
+        )
+    # The blocks behind the hooked layer are left unread on purpose; nothing that was built may stay unread.
+    if info["missing_keys"] or info["mismatched_keys"]:
+        raise ValueError(
+            f"the weights in {origin} are incomplete: missing {sorted(info['missing_keys'])[:5]}, "
+            f"of the wrong shape {sorted(info['mismatched_keys'])[:5]}"
+        )
+    return model
+
+
+def random_transformers(config: Any, seed: int) -> nn.Module:
+    """A model of transformers with random weights, the same for the same seed."""
+    from transformers import AutoModel
+
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return AutoModel.from_config(config, attn_implementation="sdpa")
+
+
+def read_checkpoint(path: Path, how: str) -> Mapping[str, Any]:
+    """What ``torch.load`` finds in a file, weights only.
+
+    Raises:
+        WeightsNotFoundError: no such file.
+        ValueError: no checkpoint, or not a mapping.
+    """
+    if not path.is_file():
+        raise WeightsNotFoundError(f"no weights at {path}.\n{how}")
+    try:
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:
+        raise ValueError(f"{path} is not a checkpoint that torch.load can read: {error}\n{how}") from error
+    if not isinstance(checkpoint, Mapping):
+        raise ValueError(f"{path} holds no state dictionary but a {type(checkpoint).__name__}\n{how}")
+    return checkpoint
+
+
+def load_state(module: nn.Module, state: Mapping[str, Tensor], origin: Path, how: str) -> None:
+    """Load exactly the module's own keys, whatever else ``state`` holds.
+
+    Raises:
+        ValueError: keys are missing, or of the wrong shape.
+    """
+    own = module.state_dict()
+    # Old checkpoints may lack the counters of batch normalisation, which play no part in inference.
+    missing = [key for key in own if key not in state and not key.endswith("num_batches_tracked")]
+    wrong = [key for key in own if key in state and state[key].shape != own[key].shape]
+    if missing or wrong:
+        raise ValueError(
+            f"the weights in {origin} do not fit: missing {missing[:5]}, of the wrong shape {wrong[:5]}; "
+            f"it holds {list(state)[:5]}\n{how}"
+        )
+    module.load_state_dict({key: state.get(key, value) for key, value in own.items()})
+
+
+def weights_checksum(module: nn.Module) -> str:
+    """SHA-256 over the values of a module's parameters, whatever their names, device and float type.
+
+    Names are left out because they differ between versions of transformers, the mask token because it plays no
+    part in inference.
+    """
+    digests = []
+    for name, value in module.state_dict().items():
+        if name.endswith("mask_token"):
+            continue
+        array = value.detach().to("cpu", torch.float32).contiguous().numpy()
+        digest = hashlib.sha256(str(array.shape).encode())
+        digest.update(array.data)
+        digests.append(digest.digest())
+    return hashlib.sha256(b"".join(sorted(digests))).hexdigest()
+
+
+def _plain(value: Any) -> Any:
+    """Lists, also those of a YAML file, as tuples."""
+    is_list = hasattr(value, "__iter__") and not isinstance(value, str)
+    return tuple(value) if is_list else value
+
+
+@contextmanager
+def _quiet_transformers() -> Iterator[None]:
+    """Keep transformers from reporting the blocks that are left out on purpose, and from drawing bars."""
+    from transformers.utils import logging
+
+    verbosity, bar = logging.get_verbosity(), logging.is_progress_bar_enabled()
+    logging.set_verbosity_error()
+    logging.disable_progress_bar()
+    try:
+        yield
+    finally:
+        logging.set_verbosity(verbosity)
+        if bar:
+            logging.enable_progress_bar()

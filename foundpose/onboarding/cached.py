@@ -1,0 +1,197 @@
+"""Onboarding with files between its stages, so that a changed setting redoes only what depends on it."""
+
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from foundpose.features.base import Fingerprint
+from foundpose.features.pca import PcaProjection
+from foundpose.onboarding.artefacts import ArtefactStore
+from foundpose.onboarding.compression import PackedPictures, join_pictures, pack_pictures, unpack_pictures
+from foundpose.onboarding.onboarder import Onboarder
+from foundpose.onboarding.representation import ObjectRepresentation
+from foundpose.onboarding.stages import FittedWords, PatchTable, Progress, ignore_progress
+from foundpose.onboarding.templates import TemplateCameras
+from foundpose.rendering import Mesh
+
+Facts = dict[str, Any]
+_PROJECTION = "projection."
+
+
+class CachedOnboarding:
+    """Onboards objects as an :class:`Onboarder` does, bit for bit, and keeps the results of its stages.
+
+    Each kind of artefact depends on the one before and on the settings named here, and on nothing else:
+
+    - ``renderings``: mesh, renderer, viewpoints, size, fill and distance of the templates;
+    - ``patches``: stride, offset and grid of the extractor, erosion of the masks;
+    - ``descriptors``: fingerprint of the extractor;
+    - ``words``: number of components, settings of the visual words.
+
+    An artefact is made only when one that needs it is missing: with ``patches`` and ``words`` there, the others may
+    be deleted. Settings that leave the result alone but for rounding (batch size, device) are not told apart, nor
+    is the precision in which a network is run: clear the artefacts to compare those.
+
+    Args:
+        onboarder: computes the stages.
+        artefacts: keeps their results.
+        fingerprint: of the onboarder's extractor, where the caller knows it already.
+    """
+
+    def __init__(
+        self, onboarder: Onboarder, artefacts: ArtefactStore, fingerprint: Fingerprint | None = None
+    ) -> None:
+        self.onboarder = onboarder
+        self.artefacts = artefacts
+        self.fingerprint = onboarder.extractor.fingerprint() if fingerprint is None else fingerprint
+
+    def __call__(self, mesh: Mesh, name: str, progress: Progress | None = None) -> ObjectRepresentation:
+        """Onboard an object; see :meth:`Onboarder.forward`.
+
+        Args:
+            mesh: the object.
+            name: what to call it.
+            progress: is told of the stages that are not there yet: beside the onboarder's own, "renderings" and
+                "patches".
+        """
+        report = progress or ignore_progress
+        with self.onboarder.constants():
+            cameras, patches = self._patches(mesh, report)
+            fitted, template_cls = self._words(mesh, report)
+            return self.onboarder.assemble(mesh, name, cameras, patches, template_cls, fitted, report)
+
+    def facts(self, mesh: Mesh) -> dict[str, Facts]:
+        """What each kind of artefact of an object depends on."""
+        onboarder, extractor = self.onboarder, self.onboarder.extractor
+        renderings = {
+            "mesh": mesh.checksum,
+            "renderer": repr(onboarder.renderer),
+            "bits": onboarder.renderer.bits,
+            "viewpoints": repr(onboarder.viewpoints),
+            "image_size": onboarder.image_size,
+            "fill": onboarder.fill,
+            "distance": onboarder.distance,
+        }
+        patches = {
+            "renderings": self.artefacts.key("renderings", renderings),
+            "stride": extractor.stride,
+            "offset": extractor.offset,
+            "grid": extractor.grid_size(onboarder.image_size),
+            "mask_erosion": onboarder.mask_erosion,
+        }
+        descriptors = {
+            "patches": self.artefacts.key("patches", patches),
+            "extractor": self.fingerprint,
+        }
+        words = {
+            "descriptors": self.artefacts.key("descriptors", descriptors),
+            "num_components": onboarder.projection.num_components,
+            "words": repr(onboarder.words),
+        }
+        return {"renderings": renderings, "patches": patches, "descriptors": descriptors, "words": words}
+
+    def _get(self, kind: str, mesh: Mesh, make: Callable[[], Mapping[str, Tensor]]) -> dict[str, Tensor]:
+        return self.artefacts.get(kind, self.facts(mesh)[kind], make)
+
+    def _renderings(self, mesh: Mesh, report: Progress) -> tuple[TemplateCameras, PackedPictures]:
+        """Cameras and compressed pictures of all templates."""
+        onboarder = self.onboarder
+
+        def make() -> Mapping[str, Tensor]:
+            cameras = onboarder.cameras(mesh)
+            packed = join_pictures(
+                [
+                    pack_pictures(*onboarder.render(mesh, batch), onboarder.renderer.bits)
+                    for batch, _ in onboarder.batches(cameras, "renderings", report)
+                ]
+            )
+            return cameras._asdict() | packed._asdict()
+
+        tensors = self._get("renderings", mesh, make)
+        return TemplateCameras(*_pick(tensors, TemplateCameras._fields)), PackedPictures(
+            *_pick(tensors, PackedPictures._fields)
+        )
+
+    def _unpack(self, packed: PackedPictures, rows: slice) -> tuple[Tensor, Tensor]:
+        """Pictures and masks of some templates, on the extractor's device."""
+        size = (self.onboarder.image_size, self.onboarder.image_size)
+        levels, masks = unpack_pictures(packed, rows, size, self.onboarder.renderer.bits)
+        return levels.to(self.onboarder.device), masks.to(self.onboarder.device)
+
+    def _patches(self, mesh: Mesh, report: Progress) -> tuple[TemplateCameras, PatchTable]:
+        """Cameras of all templates and their valid patches."""
+        onboarder = self.onboarder
+
+        def make() -> Mapping[str, Tensor]:
+            cameras, packed = self._renderings(mesh, report)
+            tables = [
+                onboarder.register(mesh, batch, self._unpack(packed, rows)[1])
+                for batch, rows in onboarder.batches(cameras, "patches", report)
+            ]
+            table = PatchTable(*(torch.cat(parts) for parts in zip(*tables, strict=True)))
+            return cameras._asdict() | table._asdict()
+
+        tensors = self._get("patches", mesh, make)
+        return TemplateCameras(*_pick(tensors, TemplateCameras._fields)), PatchTable(
+            *_pick(tensors, PatchTable._fields)
+        )
+
+    def _descriptors(self, mesh: Mesh, report: Progress) -> tuple[list[Tensor], Tensor]:
+        """Descriptors of each batch of templates, and all global ones."""
+        onboarder = self.onboarder
+        _, patches = self._patches(mesh, report)
+        counts = patches.counts
+        ends = [0, *counts.cumsum(0).tolist()]
+
+        def make() -> Mapping[str, Tensor]:
+            cameras, packed = self._renderings(mesh, report)
+            # Filled batch by batch: joining a list would take the memory twice.
+            descriptors = torch.empty(ends[-1], onboarder.extractor.channels)
+            cls = []
+            for _, rows in onboarder.batches(cameras, "templates", report):
+                of_batch = slice(ends[rows.start], ends[rows.stop])
+                table = PatchTable(
+                    patches.points_model[of_batch], patches.patch_index[of_batch], counts[rows]
+                )
+                levels, _ = self._unpack(packed, rows)
+                described = onboarder.describe(
+                    levels, PatchTable(*(part.to(onboarder.device) for part in table))
+                )
+                descriptors[of_batch] = described.descriptors.cpu()
+                cls.append(described.template_cls.cpu())
+            return {"descriptors": descriptors, "template_cls": torch.cat(cls)}
+
+        tensors = self._get("descriptors", mesh, make)
+        # The same batches as without files: sums and products round in the same way.
+        sizes = [int(batch.sum()) for batch in counts.split(onboarder.batch_size)]
+        return list(tensors["descriptors"].split(sizes)), tensors["template_cls"]
+
+    def _words(self, mesh: Mesh, report: Progress) -> tuple[FittedWords, Tensor]:
+        """Projection, words and projected descriptors; and the templates' global descriptors."""
+        onboarder = self.onboarder
+
+        def make() -> Mapping[str, Tensor]:
+            raw, template_cls = self._descriptors(mesh, report)
+            fitted = onboarder.fit(raw, report)
+            state = {_PROJECTION + name: value for name, value in fitted.projection.state_dict().items()}
+            # Kept here as well, so that the raw descriptors, the largest files by far, may be deleted.
+            return state | {
+                "words": fitted.words,
+                "descriptors": fitted.descriptors,
+                "template_cls": template_cls,
+            }
+
+        tensors = self._get("words", mesh, make)
+        state = {
+            name.removeprefix(_PROJECTION): t for name, t in tensors.items() if name.startswith(_PROJECTION)
+        }
+        projection = PcaProjection(onboarder.projection.num_components).to(state["components"])
+        projection.load_state_dict(state)
+        return FittedWords(projection, tensors["words"], tensors["descriptors"]), tensors["template_cls"]
+
+
+def _pick(tensors: Mapping[str, Tensor], names: Iterable[str]) -> list[Tensor]:
+    """Tensors of some names, in that order."""
+    return [tensors[name] for name in names]

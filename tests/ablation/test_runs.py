@@ -1,0 +1,127 @@
+import csv
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from foundpose.ablation import RunRecord, collect_runs
+from foundpose.ablation.runs import run_folder, run_settings, varied_alone
+from tests.bop_dataset import make_bop_dataset
+from tests.evaluation.test_app import ENVIRONMENT
+from tests.test_config import load
+from tests.test_experiments import SMALL, run_app
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    return make_bop_dataset(tmp_path_factory.mktemp("ablation") / "tiny", images=3)
+
+
+@pytest.fixture(scope="module")
+def arguments(root):
+    return ["extractor=dense_sift", f"data.root={root}", "masks=gt", *SMALL, "trainer.accelerator=cpu"]
+
+
+def test_settings_are_literal_and_once():
+    settings = run_settings(load("ablate", "extractor=dense_sift", "words.num_words=77"))
+    assert settings["words.num_words"] == 77
+    assert settings["sigma"] == 0.3
+    assert settings["onboarder.idf_mode"] == "document"
+    assert "onboarder.words.num_words" not in settings
+    assert "bow.sigma" not in settings
+    assert not any(key.startswith(("folder", "representations", "hydra")) for key in settings)
+
+
+def test_folders_tell_settings_apart_and_nothing_else(tmp_path):
+    def folder(*overrides, name="x"):
+        return run_folder(load("ablate", f"folder={tmp_path}", *overrides), name)
+
+    base = folder()
+    assert folder("trainer.devices=4", "device=cuda", "representations=elsewhere", "method=other") == base
+    assert folder("pnp.iterations=200") != base
+    assert folder("sigma=3") != base
+    assert folder("data.split=val") != base
+    assert folder("data.root=/somewhere/lmo", name="a").name.startswith("lmo-a-")
+
+
+def run(**settings):
+    return RunRecord(None, None, "tiny", "finished", settings=settings, figures={"AR": 0.5})
+
+
+def test_runs_that_differ_in_one_setting():
+    runs = [run(a=1, b=1), run(a=2, b=1), run(a=1, b=2), run(a=3, b=3)]
+    assert varied_alone(runs, "a") == [[runs[0], runs[1]]]
+    assert varied_alone(runs, "b") == [[runs[0], runs[2]]]
+    assert varied_alone(runs[:1], "a") == []
+
+
+def test_a_sweep_from_the_command_line(arguments, tmp_path):
+    """Runs are cached, shared, reported; a failed one stops no other and is tried again."""
+    folder = tmp_path / "ablate"
+
+    def sweep(*overrides):
+        command = [sys.executable, str(ROOT / "experiments" / "ablate.py"), "-m", *arguments]
+        return subprocess.run(
+            [*command, f"folder={folder}", *overrides],
+            env=ENVIRONMENT,
+            capture_output=True,
+            text=True,
+            timeout=400,
+        )
+
+    # More PCA components than there are channels cannot work.
+    first = sweep("projection.num_components=16,999,32")
+    assert first.returncode == 1, first.stderr[-2000:]
+    records = collect_runs(folder / "runs")
+    by_components = {r.settings["projection.num_components"]: r for r in records}
+    assert {k: r.status for k, r in by_components.items()} == {
+        16: "finished",
+        999: "failed",
+        32: "finished",
+    }
+    assert by_components[999].error.startswith("ValueError: num_components is 999 but the extractor's")
+    assert "ValueError" in (by_components[999].folder / "error.txt").read_text()
+    assert "1 failed" in first.stdout
+    figures = by_components[32].figures
+    assert figures["targets"] == 3
+    assert 0 <= figures["AR_MSPD"] <= 1
+    assert figures["seconds_per_instance.pnp"] > 0
+    assert figures["memory.descriptors"] == pytest.approx(2 * by_components[16].figures["memory.descriptors"])
+
+    with (folder / "results.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["status"] for row in rows].count("finished") == 2
+    for name in ("table1.md", "table1.tex", "table2.md", "sweep_projection_num_components.md", "memory.md"):
+        assert (folder / "tables" / name).stat().st_size > 100
+    assert (folder / "plots" / "projection_num_components.png").stat().st_size > 5_000
+
+    # Nothing that is finished is repeated, and nothing that is shared is made again.
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*.safetensors")}
+    again = sweep("projection.num_components=16,32", "launcher=joblib")
+    assert again.stdout.count("already there") == 2 or again.stderr.count("already there") == 2
+    third = sweep("projection.num_components=32", "pnp.iterations=50", "launcher=joblib")
+    assert "2 runs finished" not in third.stdout
+    assert {path: path.stat().st_mtime_ns for path in folder.rglob("*.safetensors")} == before
+
+
+def test_a_single_run_of_an_experiment(root, tmp_path, monkeypatch, capsys):
+    run_app(
+        monkeypatch,
+        "ablate",
+        "experiment=oracle",
+        f"data.root={root}",
+        "masks=gt",
+        *SMALL,
+        "trainer.accelerator=cpu",
+        f"folder={tmp_path}",
+    )
+    (record,) = collect_runs(tmp_path / "runs")
+    assert record.name == "oracle"
+    assert record.label is None
+    assert record.figures["AR_MSPD"] > 0.9
+    assert "1 runs finished, 0 failed" in capsys.readouterr().out
+    assert json.loads((record.folder / "scores.json").read_text())["targets"] == 3
