@@ -1,9 +1,11 @@
 import re
 
 import pytest
+import torch
 
 from foundpose.ablation import memory_table, paper_memory, paper_numbers, recorded_memory
-from foundpose.onboarding import ObjectRepresentation
+from foundpose.features import PcaProjection
+from foundpose.onboarding import ObjectRepresentation, RepresentationInfo
 from tests.ablation.runs import markdown_rows, sweep_run
 from tests.ablation.test_tables import check_latex, check_markdown
 
@@ -118,3 +120,43 @@ def test_parts_of_means_need_not_add_up_to_the_last_bit() -> None:
     assert "0.30" in memory_table({"a": {"x": 0.1 * MIB, "y": 0.2 * MIB, "total": 0.3 * MIB}})
     with pytest.raises(ValueError, match="'a' takes no memory"):
         memory_table({"a": {}})
+
+
+@pytest.mark.parametrize(
+    ("templates", "dimensions", "words", "descriptors_mib", "bow_mib"),
+    [(800, 256, 2048, 234.375, 6.25), (400, 128, 1024, 58.59375, 1.5625)],
+)
+def test_a_representation_of_the_papers_size(
+    templates: int, dimensions: int, words: int, descriptors_mib: float, bow_mib: float
+) -> None:
+    """The paper's 234 MB and 59 MB are the patch descriptors of such a representation; the rest comes on top."""
+    count = templates * 300
+
+    def empty(*shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
+        return torch.empty(*shape, dtype=dtype, device="meta")  # sizes without memory
+
+    def representation(storage: torch.dtype) -> ObjectRepresentation:
+        return ObjectRepresentation(
+            projection=PcaProjection(dimensions),
+            words=empty(words, dimensions),
+            idf=empty(words),
+            template_bow=empty(templates, words),
+            descriptors=empty(count, dimensions, dtype=storage),
+            points_model=empty(count, 3),
+            patch_index=empty(count, dtype=torch.int16),
+            template_offsets=torch.arange(templates + 1) * 300,
+            T_template_from_model=empty(templates, 4, 4),
+            K_template=empty(templates, 3, 3),
+            template_cls=None,
+            info=RepresentationInfo("x", 1.0, "", {}, 420, 14.0, 6.5, 30),
+        )
+
+    sizes = {name: size / 2**20 for name, size in representation(torch.float32).memory_bytes().items()}
+    assert sizes["descriptors"] == descriptors_mib
+    assert sizes["template_bow"] == bow_mib
+    closed_form = paper_memory(templates, 300, dimensions, words)
+    assert closed_form["total"] / 2**20 == descriptors_mib + bow_mib
+    # Points, patch cells, words and cameras: what the paper leaves out.
+    assert 1.0 < sizes["total"] - descriptors_mib - bow_mib < 6.0
+    half = representation(torch.float16).memory_bytes()
+    assert half["descriptors"] / 2**20 == descriptors_mib / 2

@@ -23,7 +23,8 @@ def root(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def arguments(root):
-    return ["extractor=dense_sift", f"data.root={root}", "masks=gt", *SMALL, "trainer.accelerator=cpu"]
+    small = ["viewpoints.count=20", "words.num_words=32", "crop.size=140", "projection.num_components=32"]
+    return ["extractor=dense_sift", f"data.root={root}", "masks=gt", *small, "trainer.accelerator=cpu"]
 
 
 def test_settings_are_literal_and_once():
