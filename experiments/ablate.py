@@ -10,12 +10,16 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from foundpose.ablation import run_once
+from foundpose.config import clear_errors
 
 
 @hydra.main(version_base="1.3", config_path="../conf", config_name="ablate")
 def main(cfg: DictConfig) -> None:
     """Evaluate one set of settings; the report over all runs follows when the last one is done."""
-    run_once(cfg, HydraConfig.get().runtime.choices.get("experiment"))
+    hydra_config = HydraConfig.get()
+    with clear_errors():
+        if not cfg.report_only:
+            run_once(cfg, hydra_config.runtime.choices.get("experiment"), hydra_config.overrides.task)
 
 
 if __name__ == "__main__":

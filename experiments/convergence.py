@@ -49,7 +49,7 @@ def run(cfg: DictConfig, output: Path) -> None:
     objects = {}
     for obj_id in wanted_objects(cfg, dataset):
         mesh = load_mesh(dataset.mesh_path(obj_id))
-        name = f"{dataset.root.name}-{obj_id:06d}"
+        name = f"{dataset.name}-{obj_id:06d}"
         objects[obj_id] = (mesh, method.store.get(mesh, name, ProgressBars(name)).to(cfg.device))
     degrees = torch.linspace(0, cfg.max_degrees, cfg.perturbations + 1)[1:]
     generator = torch.Generator().manual_seed(cfg.seed)

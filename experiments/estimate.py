@@ -40,7 +40,7 @@ from foundpose.timing import StageTimer
 from foundpose.visualization import save_estimate_figure
 
 # Settings that may change when a run is resumed.
-MAY_CHANGE = ("device", "max_images", "overlays", "representations")
+MAY_CHANGE = ("device", "max_images", "overlays", "representations", "artefacts")
 
 
 @hydra.main(version_base="1.3", config_path="../conf", config_name="estimate")
@@ -171,7 +171,7 @@ def estimate_dataset(cfg: DictConfig, output: Path) -> None:
 
     add_image_times(entries)
     write_json(output / "estimates.json", entries)
-    csv = output / result_file_name(cfg.method, dataset.root.name, cfg.data.split)
+    csv = output / result_file_name(cfg.method, dataset.name, cfg.data.split)
     write_results(csv, best_results(to_results(entries), dataset.targets()))
     valid = sum(entry["valid"] for entry in entries)
     print(f"{len(entries)} instances in {len(images)} images, {valid} with a pose; written to {csv}")

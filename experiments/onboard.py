@@ -24,8 +24,7 @@ def meshes_to_onboard(cfg: DictConfig) -> dict[str, Path]:
         return {Path(cfg.mesh).stem: Path(cfg.mesh)}
     dataset: BopDataset = instantiate(cfg.data)
     return {
-        f"{dataset.root.name}-{obj_id:06d}": dataset.mesh_path(obj_id)
-        for obj_id in wanted_objects(cfg, dataset)
+        f"{dataset.name}-{obj_id:06d}": dataset.mesh_path(obj_id) for obj_id in wanted_objects(cfg, dataset)
     }
 
 

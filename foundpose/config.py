@@ -21,6 +21,23 @@ from foundpose.onboarding import ArtefactStore, Onboarder, RepresentationStore
 from foundpose.pipeline import FoundPose
 from foundpose.rendering import RendererNotAvailableError
 
+# Settings that may change when an evaluation is resumed: they change no pose, or say where things lie and what they
+# are called.
+MAY_CHANGE = (
+    "device",
+    "trainer",
+    "errors",
+    "memory_limit",
+    "representations",
+    "artefacts",
+    "method",
+    "row",
+    "folder",
+    "report_only",
+    "data_module.num_workers",
+    "data_module.prepare_data_per_node",
+)
+
 
 class Method(NamedTuple):
     """What ``conf/config.yaml`` describes.

@@ -2,6 +2,7 @@
 
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
 
 import torch
 
@@ -22,7 +23,7 @@ class DatasetObjects:
         dataset: the dataset.
         store: keeps representations on disk and makes missing ones.
         memory_limit: MiB that loaded representations may take together; None for no limit. Sizes are those of the
-            files, which hold little but the tensors.
+            files, which hold little but the tensors. Meshes come on top and stay.
     """
 
     def __init__(
@@ -34,6 +35,7 @@ class DatasetObjects:
         self.store = store
         self.memory_limit = memory_limit
         self._meshes: dict[int, Mesh] = {}
+        self._paths: dict[int, Path] = {}
         self._loaded: OrderedDict[int, ObjectRepresentation] = OrderedDict()
 
     def mesh(self, obj_id: int) -> Mesh:
@@ -55,7 +57,7 @@ class DatasetObjects:
 
     def name(self, obj_id: int) -> str:
         """Name of an object's representation."""
-        return f"{self.dataset.root.name}-{obj_id:06d}"
+        return f"{self.dataset.name}-{obj_id:06d}"
 
     def onboard(self, ids: Iterable[int], progress: Callable[[str], Progress] | None = None) -> None:
         """Make the representations that are not in the store yet.
@@ -71,7 +73,9 @@ class DatasetObjects:
 
     def size(self, obj_id: int) -> float:
         """MiB of an onboarded object's representation."""
-        return self.store.path(self.mesh(obj_id), self.name(obj_id)).stat().st_size / MIB
+        if obj_id not in self._paths:
+            self._paths[obj_id] = self.store.path(self.mesh(obj_id), self.name(obj_id))
+        return self._paths[obj_id].stat().st_size / MIB
 
     def representations(
         self, ids: Sequence[int], device: torch.device | str = "cpu"

@@ -14,7 +14,7 @@ def pose_records(estimates: PoseEstimates) -> list[dict[str, Any]]:
     """One record per estimate, of numbers and lists that JSON can hold.
 
     Args:
-        estimates: poses of B crops, on any device (read once for the whole batch).
+        estimates: poses of B crops, on any device (read field by field, not crop by crop).
 
     Returns:
         B records: ``valid``, ``status`` (name), ``score``, ``num_inliers``, ``num_patches`` of the crop, ``R`` (3

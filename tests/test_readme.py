@@ -53,3 +53,7 @@ def test_every_option_of_the_configuration_is_listed():
             if re.fullmatch(r"table2_row(0[2-9]|10)", name):  # "table2_row01 to table2_row11"
                 continue
             assert f"`{name}`" in README, f"{group.name}={option.stem}"
+
+
+def test_nothing_is_left_to_be_filled_in():
+    assert "@@" not in README

@@ -2,10 +2,12 @@
 
 import hashlib
 import json
+import re
 import sys
 import traceback
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +20,20 @@ from foundpose.ablation.records import RUN_FILE, RunRecord, collect_runs, varied
 from foundpose.ablation.sweeps import SWEEP_FIGURES, sweep_table
 from foundpose.ablation.tables import paper_table
 from foundpose.ablation.text_tables import Format
+from foundpose.config import MAY_CHANGE
 from foundpose.io import write_atomically
 
 # Keys that say where things lie and what they are called, not what is computed.
-_NOT_SETTINGS = ("folder", "representations", "artefacts", "results", "method", "row")
+_NOT_SETTINGS = ("folder", "representations", "artefacts", "results", "method", "row", "report_only")
+# What may be overridden in an experiment that is a row of the paper: it stays that row.
+_ROW_MAY_CHANGE = (
+    *_NOT_SETTINGS,
+    *("experiment", "sweep", "launcher", "hydra"),
+    *("data", "masks.path", "objects", "max_images"),
+    *("trainer", "device", "data_module", "evaluation", "errors", "memory_limit"),
+    *("extractor.weights", "extractor.seed", "extractor.config"),
+)
+_WHOLE_REFERENCE = re.compile(r"\$\{[^}]*\}")
 _FORMATS: tuple[tuple[str, Format], ...] = ((".md", "markdown"), (".tex", "latex"))
 _NOT_VARIED = ("masks.path", "data.root")
 
@@ -38,7 +50,7 @@ def run_settings(cfg: DictConfig) -> dict[str, Any]:
     settings: dict[str, Any] = {}
 
     def collect(literal: Any, resolved: Any, key: str) -> None:
-        if isinstance(literal, str) and literal.startswith("${") and not literal.startswith("${oc."):
+        if isinstance(literal, str) and _WHOLE_REFERENCE.fullmatch(literal):
             return
         if isinstance(literal, dict) and literal:
             for name, value in literal.items():
@@ -52,65 +64,92 @@ def run_settings(cfg: DictConfig) -> dict[str, Any]:
     return settings
 
 
-def run_folder(cfg: DictConfig, name: str | None) -> Path:
-    """Folder of a run below ``cfg.folder``: the same for the same settings, whatever they were called."""
-    # How many processes share the work, and on what, changes no result.
+def run_folder(cfg: DictConfig) -> Path:
+    """Folder of a run below ``cfg.folder``: the same for the same settings, whatever they are called."""
     kept = {
-        k: v for k, v in run_settings(cfg).items() if k.split(".")[0] not in ("trainer", "device", "errors")
+        key: value
+        for key, value in run_settings(cfg).items()
+        if not any(key == name or key.startswith(f"{name}.") for name in MAY_CHANGE)
     }
     digest = hashlib.sha256(json.dumps(kept, sort_keys=True, default=str).encode()).hexdigest()[:12]
-    return Path(cfg.folder) / "runs" / f"{_dataset(cfg)}-{name or 'run'}-{digest}"
+    return Path(cfg.folder) / "runs" / f"{_dataset(cfg)}-{digest}"
 
 
-def run_once(cfg: DictConfig, name: str | None = None) -> RunRecord:
+def run_once(cfg: DictConfig, name: str | None = None, overrides: Sequence[str] = ()) -> RunRecord:
     """Evaluate one set of settings unless that has been done, and record it.
 
     Args:
         cfg: as ``conf/ablate.yaml``.
-        name: of the experiment, for the record and the folder.
+        name: of the experiment, for the record.
+        overrides: what the user changed in it, as ``key=value``. A row of the paper with other settings is not that
+            row any more, and recorded without it.
 
     Returns:
-        The record, which lies in the run's folder as ``run.json``. A run that fails is recorded too, with its error
-        (``error.txt`` has the whole of it), and is tried again the next time, from where it stopped.
-    """
-    from foundpose.evaluation import run_evaluation  # Lightning takes its time; reports do without
+        The record, which lies in the run's folder as ``run.json``. A run that fails or is killed is recorded too (with
+        its error; ``error.txt`` has the whole of it), and is tried again the next time, from where it stopped.
 
-    folder = run_folder(cfg, name)
+    Raises:
+        ValueError: settings that only ``evaluate.py`` knows what to do with.
+    """
+    _refuse_several_processes(cfg)
+    if cfg.results is not None:
+        raise ValueError("ablate.py estimates poses; score a file with experiments/evaluate.py results=…")
+    folder, settings = run_folder(cfg), run_settings(cfg)
+    row = cfg.row if _is_still_the_row(overrides) else None
+    if row != cfg.row:
+        print(f"not {cfg.row} any more, with {', '.join(overrides)}: recorded without it")
+    facts: dict[str, Any] = {"name": name, "row": row, "dataset": _dataset(cfg), "label": _label(settings)}
     if (folder / RUN_FILE).is_file():
         before = RunRecord.read(folder / RUN_FILE)
-        if before.status == "finished":
+        if before.status == "finished" and before.settings.get("errors") == settings["errors"]:
             print(f"already there: {folder}")
+            if before.row is None and row is not None:
+                before = replace(before, name=name, row=row)
+                before.write(folder)
             return before
-    facts: dict[str, Any] = {
-        "name": name,
-        "row": cfg.row,
-        "dataset": _dataset(cfg),
-        "label": _label(cfg),
-        "settings": run_settings(cfg),
-    }
+    # If it is killed, this is what is found.
+    started = RunRecord(**facts, settings=settings, status="failed", error="it was started and has not ended")
+    started.write(folder)
     try:
+        # Imported here because Lightning takes its time, and reports do without.
+        from foundpose.evaluation import run_evaluation
+
         run_evaluation(cfg, folder)
-        record = RunRecord(**facts, status="finished", figures=_figures(folder))
+        record = replace(started, status="finished", error=None, figures=_figures(folder))
         (folder / "error.txt").unlink(missing_ok=True)
     except Exception as error:
         text = traceback.format_exc()
         write_atomically(folder / "error.txt", lambda temporary: temporary.write_text(text))
         cause = _root_cause(error)
-        record = RunRecord(**facts, status="failed", error=f"{type(cause).__name__}: {cause}")
+        record = replace(started, error=f"{type(cause).__name__}: {cause}")
         print(f"failed: {folder}: {record.error}", file=sys.stderr)
     record.write(folder)
     return record
+
+
+def _refuse_several_processes(cfg: DictConfig) -> None:
+    trainer = cfg.trainer
+    if trainer.strategy != "auto" or trainer.num_nodes != 1 or trainer.devices not in (1, "1"):
+        raise ValueError(
+            "ablate.py gives each run one process and runs several at a time (launcher=joblib or slurm); for one "
+            "evaluation on many GPUs use experiments/evaluate.py trainer=ddp"
+        )
+
+
+def _is_still_the_row(overrides: Sequence[str]) -> bool:
+    keys = [override.lstrip("+~").partition("=")[0].replace("/", ".") for override in overrides]
+    return all(any(key == name or key.startswith(f"{name}.") for name in _ROW_MAY_CHANGE) for key in keys)
 
 
 def _dataset(cfg: DictConfig) -> str:
     return Path(str(cfg.data.root)).expanduser().resolve().name
 
 
-def _label(cfg: DictConfig) -> str | None:
+def _label(settings: Mapping[str, Any]) -> str | None:
     """Why a run's figures mean nothing, if so."""
-    if cfg.extractor.get("weights") == "random":
-        return "random weights: the figures mean nothing"
-    return None
+    # An extractor may wrap another one.
+    weights = [value for key, value in settings.items() if re.fullmatch(r"(extractor\.)+weights", key)]
+    return "random weights: the figures mean nothing" if "random" in weights else None
 
 
 def _root_cause(error: BaseException) -> BaseException:
@@ -200,7 +239,12 @@ class SweepReport(Callback):
         self._report(config)
 
     def _report(self, config: DictConfig) -> None:
-        records = write_reports(config.folder)
+        # Hydra turns errors of a callback into warnings; SystemExit gets through.
+        try:
+            records = write_reports(config.folder)
+        except Exception:
+            traceback.print_exc()
+            sys.exit(1)
         failed = [record for record in records if record.status == "failed"]
         print(f"{len(records) - len(failed)} runs finished, {len(failed)} failed; see {config.folder}")
         for record in failed:

@@ -4,7 +4,14 @@ from collections import defaultdict
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from foundpose.ablation.paper import PaperDataset, PaperRow, paper_datasets, paper_numbers, read_paper_table
+from foundpose.ablation.paper import (
+    PaperDataset,
+    PaperRow,
+    find_paper_row,
+    paper_datasets,
+    paper_numbers,
+    read_paper_table,
+)
 from foundpose.ablation.records import RunRecord, varied_settings
 from foundpose.ablation.text_tables import MISSING, Cell, Format, Heading, Style, TextTable
 from foundpose.ablation.units import mean, significant, why_no_figures
@@ -87,7 +94,12 @@ def _runs_by_cell(records: Sequence[RunRecord]) -> dict[tuple[str, str], list[Ru
 def _pick(runs: dict[tuple[str, str], list[RunRecord]], row: PaperRow, dataset: str) -> list[RunRecord]:
     """Runs of a row, or else of the row of another table that is the same experiment."""
     own = runs.get((row.experiment, dataset))
-    return own or (runs.get((row.same_as, dataset), []) if row.same_as else [])
+    if own:
+        return own
+    same = [
+        name for name, where in runs if where == dataset and find_paper_row(name).same_as == row.experiment
+    ]
+    return [run for name in [row.same_as, *same] if name for run in runs.get((name, dataset), [])]
 
 
 def _ours(runs: Sequence[RunRecord], dataset: PaperDataset) -> _Ours:

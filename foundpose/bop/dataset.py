@@ -62,6 +62,11 @@ class BopDataset:
         self.models_info = self._read_models_info(self.models)
 
     @property
+    def name(self) -> str:
+        """Name of the dataset's folder, such as ``lmo``."""
+        return self.root.resolve().name
+
+    @property
     def object_ids(self) -> list[int]:
         """Ids of all objects, ascending."""
         return sorted(self.models_info)

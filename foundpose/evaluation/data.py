@@ -28,7 +28,7 @@ class PoseBatch(NamedTuple):
         images: N pictures (3, H, W) in [0, 1], each once; sizes may differ.
         K: (N, 3, 3) intrinsics, pixels.
         masks: B masks (H, W) bool, each of its image's size.
-        image_index: (B,) int64 on the CPU, the image of each mask.
+        image_index: the image of each mask, a place in ``images``.
         object_ids: the object of each mask.
         instances: what the masks are, with the detector's scores and times.
         seconds: time that reading took.
@@ -118,6 +118,7 @@ class InstanceBatches(Dataset[PoseBatch]):
             self._kept[key] = self.pictures(self.dataset, scene_id, im_id)
             while len(self._kept) > self.images_kept:
                 self._kept.popitem(last=False)
+        self._kept.move_to_end(key)
         return self._kept[key]
 
 

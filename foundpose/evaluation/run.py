@@ -14,12 +14,13 @@ from foundpose.bop import (
     Scores,
     Target,
     check_functions,
+    check_times,
     read_results,
     result_file_name,
     score_results,
     write_results,
 )
-from foundpose.config import build_method, claim_run_folder, wanted_objects
+from foundpose.config import MAY_CHANGE, build_method, claim_run_folder, wanted_objects
 from foundpose.evaluation.data import PoseDataModule
 from foundpose.evaluation.module import PoseEvaluation, estimate_dataset
 from foundpose.evaluation.report import all_records, merge_shards, timing
@@ -27,19 +28,6 @@ from foundpose.io import write_json
 from foundpose.objects import DatasetObjects
 from foundpose.progress import ProgressBars
 from foundpose.records import best_results, to_results
-
-# Settings that may change when a run is resumed: they change no pose.
-MAY_CHANGE = (
-    "device",
-    "trainer",
-    "errors",
-    "memory_limit",
-    "representations",
-    "artefacts",
-    "data_module.num_workers",
-    "data_module.prepare_data_per_node",
-    "evaluation.time_stages",
-)
 
 
 def run_evaluation(cfg: DictConfig, output: Path) -> Scores | None:
@@ -63,6 +51,7 @@ def run_evaluation(cfg: DictConfig, output: Path) -> Scores | None:
     wanted = wanted_objects(cfg, dataset)
     if cfg.results is not None:
         results = read_results(cfg.results)
+        check_times(results)
     else:
         estimated = _estimate(cfg, dataset, wanted, output)
         if estimated is None:
@@ -75,6 +64,7 @@ def _estimate(
     cfg: DictConfig, dataset: BopDataset, wanted: list[int], output: Path
 ) -> list[PoseResult] | None:
     """The poses that are handed in, in the first process; None in the others."""
+    path = output / result_file_name(cfg.method, dataset.name, cfg.data.split)
     masks = instantiate(cfg.masks)
     method = build_method(cfg)
     objects = DatasetObjects(dataset, method.store, cfg.memory_limit)
@@ -111,7 +101,6 @@ def _estimate(
     records = all_records(done)
     write_json(output / "estimates.json", records)
     results = best_results(to_results(records), dataset.targets())
-    path = output / result_file_name(cfg.method, dataset.root.name, cfg.data.split)
     write_results(path, results)
     print(f"{len(records)} instances, {sum(r['valid'] for r in records)} with a pose; written to {path}")
     return results

@@ -27,12 +27,11 @@ class CachedOnboarding:
 
     - ``renderings``: mesh, renderer, viewpoints, size, fill and distance of the templates;
     - ``patches``: stride, offset and grid of the extractor, erosion of the masks;
-    - ``descriptors``: fingerprint of the extractor;
+    - ``descriptors``: fingerprint of the extractor, and the precision that it runs in;
     - ``words``: number of components, settings of the visual words.
 
     An artefact is made only when one that needs it is missing: with ``patches`` and ``words`` there, the others may
-    be deleted. Settings that leave the result alone but for rounding (batch size, device) are not told apart, nor
-    is the precision in which a network is run: clear the artefacts to compare those.
+    be deleted. Settings that leave the result alone but for rounding (batch size, device) are not told apart.
 
     Args:
         onboarder: computes the stages.
@@ -84,6 +83,7 @@ class CachedOnboarding:
         descriptors = {
             "patches": self.artefacts.key("patches", patches),
             "extractor": self.fingerprint,
+            "precision": getattr(extractor, "precision", None),
         }
         words = {
             "descriptors": self.artefacts.key("descriptors", descriptors),

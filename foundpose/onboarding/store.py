@@ -42,6 +42,7 @@ class RepresentationStore:
             "schema": SCHEMA_VERSION,
             "mesh": mesh.checksum,
             "extractor": self._fingerprint,
+            "precision": getattr(self.onboarder.extractor, "precision", None),
             "settings": self.onboarder.settings(),
         }
         digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()

@@ -30,7 +30,7 @@ def test_experiment_runs(name, tiny_bop, tmp_path):
         f"experiment={name}",
         f"data.root={tiny_bop}",
         f"folder={tmp_path}",
-        "artefacts=null",
+        *([] if name.startswith("table2") else ["artefacts=null"]),
         "objects=[1]",
         "max_images=1",
         *(f"viewpoints.{setting}" for setting in count),
@@ -40,7 +40,7 @@ def test_experiment_runs(name, tiny_bop, tmp_path):
         "trainer.accelerator=cpu",
         *small_network(plain),
     ]
-    record = run_once(load("ablate", *overrides), name)
+    record = run_once(load("ablate", *overrides), name)  # overrides that a user makes would end the row
     assert record.status == "finished", record.error
     assert record.row == (name if name.startswith("table") else None)
     random = "weights" in plain.extractor

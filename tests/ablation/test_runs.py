@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from foundpose.ablation import RunRecord, collect_runs
+from foundpose.ablation import RunRecord, collect_runs, run_once
 from foundpose.ablation.runs import run_folder, run_settings, varied_alone
 from tests.bop_dataset import make_bop_dataset
 from tests.evaluation.test_app import ENVIRONMENT
@@ -38,15 +38,66 @@ def test_settings_are_literal_and_once():
 
 
 def test_folders_tell_settings_apart_and_nothing_else(tmp_path):
-    def folder(*overrides, name="x"):
-        return run_folder(load("ablate", f"folder={tmp_path}", *overrides), name)
+    def folder(*overrides):
+        return run_folder(load("ablate", f"folder={tmp_path}", *overrides))
 
     base = folder()
-    assert folder("trainer.devices=4", "device=cuda", "representations=elsewhere", "method=other") == base
+    same = ["trainer.devices=4", "device=cuda", "representations=elsewhere", "method=other", "errors=[mssd]"]
+    assert folder(*same, "data_module.num_workers=3", "memory_limit=100") == base
     assert folder("pnp.iterations=200") != base
     assert folder("sigma=3") != base
     assert folder("data.split=val") != base
-    assert folder("data.root=/somewhere/lmo", name="a").name.startswith("lmo-a-")
+    assert folder("data.root=/somewhere/lmo").name.startswith("lmo-")
+    # Two rows of the paper that are one experiment, and a default that is spelled out.
+    row = folder("experiment=table1_row01", "data.root=/x")
+    assert folder("experiment=table2_row01", "data.root=/x") == row
+    assert folder("experiment=table1_row01", "data.root=/x", "masks.path=/x/detections/cnos-fastsam") == row
+
+
+def test_what_only_evaluate_does_is_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"evaluate.py trainer=ddp"):
+        run_once(load("ablate", f"folder={tmp_path}", "trainer=ddp"))
+    with pytest.raises(ValueError, match=r"evaluate.py results="):
+        run_once(load("ablate", f"folder={tmp_path}", "results=x.csv"))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_row_with_other_settings_is_not_that_row(tmp_path, monkeypatch):
+    monkeypatch.setattr("foundpose.evaluation.run_evaluation", lambda cfg, folder: None)
+    monkeypatch.setattr("foundpose.ablation.runs._figures", lambda folder: {"AR": 0.5})
+
+    def row(*overrides):
+        given = ["experiment=table1_row01", *overrides]
+        return run_once(load("ablate", f"folder={tmp_path}", *given), "table1_row01", given).row
+
+    assert row() == "table1_row01"
+    assert row("data=tless", "trainer.accelerator=cpu", "max_images=3") == "table1_row01"
+    assert row("words.num_words=64") is None
+    assert row("extractor=dense_sift") is None
+
+
+def test_a_finished_run_is_done_again_only_for_other_errors(tmp_path, monkeypatch):
+    calls = []
+    monkeypatch.setattr("foundpose.evaluation.run_evaluation", lambda cfg, folder: calls.append(folder))
+    monkeypatch.setattr("foundpose.ablation.runs._figures", lambda folder: {"AR": 0.5})
+    cfg = load("ablate", f"folder={tmp_path}", "errors=[mssd]")
+    run_once(cfg)
+    run_once(cfg)
+    assert len(calls) == 1
+    run_once(load("ablate", f"folder={tmp_path}", "errors=[mssd,mspd]"))
+    assert len(calls) == 2
+    assert calls[0] == calls[1]
+
+
+def test_a_killed_run_is_listed(tmp_path, monkeypatch):
+    def killed(cfg, folder):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("foundpose.evaluation.run_evaluation", killed)
+    with pytest.raises(KeyboardInterrupt):
+        run_once(load("ablate", f"folder={tmp_path}"))
+    (record,) = collect_runs(tmp_path / "runs")
+    assert (record.status, record.error) == ("failed", "it was started and has not ended")
 
 
 def run(**settings):
@@ -103,9 +154,12 @@ def test_a_sweep_from_the_command_line(arguments, tmp_path):
     # Nothing that is finished is repeated, and nothing that is shared is made again.
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("*.safetensors")}
     again = sweep("projection.num_components=16,32", "launcher=joblib")
-    assert again.stdout.count("already there") == 2 or again.stderr.count("already there") == 2
+    assert again.stdout.count("already there") == 2, again.stderr[-2000:]
     third = sweep("projection.num_components=32", "pnp.iterations=50", "launcher=joblib")
-    assert "2 runs finished" not in third.stdout
+    assert "3 runs finished, 1 failed" in third.stdout, third.stderr[-2000:]
+    assert [r.status for r in collect_runs(folder / "runs") if r.settings["pnp.iterations"] == 50] == [
+        "finished"
+    ]
     assert {path: path.stat().st_mtime_ns for path in folder.rglob("*.safetensors")} == before
 
 
