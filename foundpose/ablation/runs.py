@@ -85,8 +85,8 @@ def run_once(cfg: DictConfig, name: str | None = None, overrides: Sequence[str] 
             row any more, and recorded without it.
 
     Returns:
-        The record, which lies in the run's folder as ``run.json``. A run that fails or is killed is recorded too (with
-        its error; ``error.txt`` has the whole of it), and is tried again the next time, from where it stopped.
+        The record, which lies in the run's folder as ``run.json``. A run that fails or is killed is recorded too, and
+        is tried again the next time, from where it stopped; ``error.txt`` has the whole of a failure's error.
 
     Raises:
         ValueError: settings that only ``evaluate.py`` knows what to do with.

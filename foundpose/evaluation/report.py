@@ -43,7 +43,8 @@ def timing(batches: Sequence[BatchRecord], device: torch.device | str) -> dict[s
     """Seconds by stage, in total and per instance, and on what.
 
     ``pipeline`` is the whole of the method and ``other`` what its stages leave of it; ``waiting`` is the time that
-    a process stood still for images, ``representations`` that of loading objects. All processes are added up.
+    a process stood still for images, ``representations`` that of loading objects. All processes are added up;
+    ``device`` and ``threads`` are those of the process that asks.
     """
     seconds: dict[str, float] = defaultdict(float)
     for batch in batches:
