@@ -196,21 +196,20 @@ def write_reports(folder: str | Path) -> list[RunRecord]:
         tables[f"memory{suffix}"] = memory_table(records, format)
     finished = [record for record in records if record.status == "finished"]
     for key in varied_settings(finished):
-        if key in _NOT_VARIED or key.endswith("_target_"):
+        groups = [] if key in _NOT_VARIED or key.endswith("_target_") else varied_alone(finished, key)
+        if not groups:
             continue
-        runs = [run for group in varied_alone(finished, key) for run in group]
-        if not runs:
-            continue
-        series = [k for k in varied_settings(runs) if k != key and not k.endswith("_target_")]
+        runs = [run for group in groups for run in group]
+        apart = _telling_apart(groups, key)
+        name = key.replace(".", "_")
         for suffix, format in _FORMATS:
-            tables[f"sweep_{key.replace('.', '_')}{suffix}"] = sweep_table(
-                runs, [*series, key], format=format
-            )
-        figures = [
-            f for f in SWEEP_FIGURES if any(run.counts and run.figures.get(f) is not None for run in runs)
-        ]
+            tables[f"sweep_{name}{suffix}"] = sweep_table(runs, [*apart, key], format=format)
+        drawn = [run for run in runs if run.counts and run.settings.get(key) is not None]
+        figures = [f for f in SWEEP_FIGURES if any(run.figures.get(f) is not None for run in drawn)]
         if figures:
-            plot_sweep(runs, key, figures, folder / "plots" / key.replace(".", "_"), _series_key(runs, key))
+            several = len({run.dataset for run in runs}) > 1
+            series = apart[0] if apart else "dataset" if several else None
+            plot_sweep(drawn, key, figures, folder / "plots" / name, series)
     for name, text in tables.items():
         _write_text(folder / "tables" / name, text)
     return records
@@ -253,13 +252,20 @@ class SweepReport(Callback):
             sys.exit(1)
 
 
-def _series_key(runs: Sequence[RunRecord], key: str) -> str | None:
-    """What tells the lines of a plot apart: the extractor where there are several."""
-    varied = varied_settings(runs)
-    for candidate in ("extractor._target_", *varied):
-        if candidate in varied and candidate != key:
-            return candidate
-    return "dataset" if len({run.dataset for run in runs}) > 1 else None
+def _telling_apart(groups: Sequence[Sequence[RunRecord]], key: str) -> list[str]:
+    """A few settings besides ``key`` that tell groups of runs apart, the extractor first."""
+    first = [group[0] for group in groups]
+    varied = [k for k in varied_settings(first) if k not in (key, *_NOT_VARIED)]
+    varied.sort(key=lambda k: (k != "extractor._target_", k.endswith("_target_"), k))
+    chosen: list[str] = []
+    kinds = 1
+    for candidate in varied:
+        values = {
+            json.dumps([run.settings.get(k) for k in [*chosen, candidate]], default=str) for run in first
+        }
+        if len(values) > kinds:
+            chosen, kinds = [*chosen, candidate], len(values)
+    return chosen
 
 
 def _write_text(path: Path, text: str) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from foundpose.ablation import RunRecord, collect_runs, run_once
-from foundpose.ablation.runs import run_folder, run_settings, varied_alone
+from foundpose.ablation.runs import _telling_apart, run_folder, run_settings, varied_alone
 from tests.bop_dataset import make_bop_dataset
 from tests.evaluation.test_app import ENVIRONMENT
 from tests.test_config import load
@@ -109,6 +109,17 @@ def test_runs_that_differ_in_one_setting():
     assert varied_alone(runs, "a") == [[runs[0], runs[1]]]
     assert varied_alone(runs, "b") == [[runs[0], runs[2]]]
     assert varied_alone(runs[:1], "a") == []
+
+
+def test_few_settings_tell_groups_apart():
+    groups = [
+        [run(**{"extractor._target_": e, "extractor.size": e, "h": h, "words": 1})]
+        for e in "ab"
+        for h in (1, 5)
+    ]
+    assert _telling_apart(groups, "words") == ["extractor._target_", "h"]
+    assert _telling_apart(groups[:2], "words") == ["h"]
+    assert _telling_apart(groups[:1], "words") == []
 
 
 def test_a_sweep_from_the_command_line(arguments, tmp_path):
