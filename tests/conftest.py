@@ -14,6 +14,11 @@ from foundpose.synthetic import procedural_mesh
 from tests.bop_dataset import make_bop_dataset
 
 
+if "PYTEST_XDIST_WORKER" in os.environ:
+    # Processes that share the cores must not each take all of them.
+    torch.set_num_threads(1)
+
+
 @pytest.fixture(scope="session")
 def lmo_root() -> Path:
     """Root of an LM-O (subset) in BOP layout: FOUNDPOSE_LMO, or shared/data/lmo beside the repository."""
