@@ -13,7 +13,6 @@ from foundpose.retrieval import SoftAssignBow, VisualWords
 from foundpose.synthetic import procedural_mesh
 from tests.bop_dataset import make_bop_dataset
 
-
 if "PYTEST_XDIST_WORKER" in os.environ:
     # Processes that share the cores must not each take all of them.
     torch.set_num_threads(1)
