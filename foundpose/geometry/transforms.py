@@ -4,9 +4,13 @@
 ``T ← se3_exp(δ) @ T``.
 """
 
+import math
+
 import torch
-from kornia.geometry.liegroup import So3
 from torch import Tensor
+
+# Below this squared angle the coefficients of the exponential map are summed as power series.
+_SMALL_SQUARED_ANGLE = 0.25
 
 
 def make_transform(R: Tensor, t: Tensor) -> Tensor:
@@ -24,7 +28,8 @@ def make_transform(R: Tensor, t: Tensor) -> Tensor:
     if R.shape[-2:] != (3, 3) or t.shape[-1] != 3:
         raise ValueError(f"R and t must end in (3, 3) and (3,), got {tuple(R.shape)} and {tuple(t.shape)}")
     top = torch.cat([R, t.unsqueeze(-1).expand(*R.shape[:-1], 1)], dim=-1)
-    bottom = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 4)
+    # Made on the device: a tensor from Python numbers would wait for it.
+    bottom = torch.eye(4, dtype=top.dtype, device=top.device)[3:].expand(*top.shape[:-2], 1, 4)
     return torch.cat([top, bottom], dim=-2)
 
 
@@ -54,10 +59,37 @@ def se3_exp(twist: Tensor) -> Tensor:
     """
     if twist.shape[-1] != 6:
         raise ValueError(f"twist must have shape (..., 6), got {tuple(twist.shape)}")
-    v, w = twist.reshape(-1, 6).split(3, dim=-1)
-    # Not kornia's Se3: it wraps a translation without history as a Parameter, which loses forward-mode tangents.
-    t = So3.left_jacobian(w) @ v.unsqueeze(-1)
-    return make_transform(So3.exp(w).matrix(), t.squeeze(-1)).reshape(*twist.shape[:-1], 4, 4)
+    # Written out, where kornia's So3 takes six times as many operations: optimisers call this in every step.
+    v, w = twist.split(3, dim=-1)
+    A, B, C = _exponential_coefficients(w.square().sum(-1, keepdim=True))
+    x, y, z = w.unbind(-1)
+    zero = torch.zeros_like(x)
+    hat = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
+    # R = I + A [w]× + B [w]×², and [w]×² = w wᵀ − |w|² I.
+    outer = (B * w).unsqueeze(-1) * w.unsqueeze(-2)
+    diagonal = 1.0 - outer.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True)
+    R = A.unsqueeze(-1) * hat + outer + torch.diag_embed(diagonal.expand_as(w))
+    t = A * v + B * torch.linalg.cross(w, v, dim=-1) + C * (w * v).sum(-1, keepdim=True) * w
+    return make_transform(R, t)
+
+
+def _exponential_coefficients(squared: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """sin θ / θ, (1 − cos θ) / θ² and (θ − sin θ) / θ³ of squared angles θ², smooth through zero."""
+    small = squared < _SMALL_SQUARED_ANGLE
+    near = torch.where(small, squared, torch.zeros_like(squared))
+    far = torch.where(small, torch.ones_like(squared), squared)
+    angle = far.sqrt()
+    B = torch.where(small, _alternating_series(near, 2), (1.0 - angle.cos()) / far)
+    C = torch.where(small, _alternating_series(near, 3), (angle - angle.sin()) / (far * angle))
+    return 1.0 - squared * C, B, C
+
+
+def _alternating_series(s: Tensor, first: int) -> Tensor:
+    """Σ (−s)ᵏ / (2k + first)! to the precision of float64 for s below the limit above."""
+    total = torch.full_like(s, 1.0 / math.factorial(10 + first))
+    for k in range(4, -1, -1):
+        total = 1.0 / math.factorial(2 * k + first) - s * total
+    return total
 
 
 def rotation_angle(R_a: Tensor, R_b: Tensor) -> Tensor:

@@ -142,8 +142,12 @@ class GaussNewtonPnp(nn.Module):
         points_model: Tensor,
         K: Tensor,
         weights: Tensor | None = None,
+        tolerance: float | None = None,
     ) -> tuple[LevenbergMarquardtResult, LocalFrame]:
-        """What :meth:`forward` does, without the covariance; see :func:`polish_pnp` for what is returned."""
+        """What :meth:`forward` does, without the covariance; see :func:`polish_pnp` for what is returned.
+
+        ``tolerance`` takes the place of this module's own.
+        """
         return polish_pnp(
             T_camera_from_model,
             points_image,
@@ -152,7 +156,7 @@ class GaussNewtonPnp(nn.Module):
             weights,
             loss=self.loss,
             max_iterations=self.max_iterations,
-            tolerance=self.tolerance,
+            tolerance=self.tolerance if tolerance is None else tolerance,
             differentiation=self.differentiation,
         )
 

@@ -206,19 +206,18 @@ def reprojection_equations(
     """
     pixels, depth, J = project_in_frame(T_local, points_local, K, frame)
     in_front = depth > 0
-    residual = pixels - points_image
-    squared = residual.square().sum(-1)
-    rho, slope = (squared, torch.ones_like(squared)) if loss is None else loss(squared)
+    residual = pixels - points_image.transpose(1, 2)
+    squared = residual.square().sum(1)
+    rho, slope = (squared, None) if loss is None else loss(squared)
     used = weights > 0
     zero = torch.zeros_like(rho)
     # Points out of use may lie anywhere, also where their residual overflows.
     cost = 0.5 * torch.where(used, weights * rho, zero).sum(-1)
     cost = cost.masked_fill((used & ~in_front).any(-1), torch.inf)
-    share = torch.where(used & in_front, weights * slope, zero)
-    J_weighted = (J * share[..., None, None]).flatten(1, 2)
-    J = J.flatten(1, 2)
-    H = J_weighted.transpose(-1, -2) @ J
-    g = (J_weighted.transpose(-1, -2) @ residual.flatten(1, 2).unsqueeze(-1)).squeeze(-1)
+    share = torch.where(used & in_front, weights if slope is None else weights * slope, zero)
+    weighted = (J * share[:, None, None]).flatten(2)
+    H = weighted @ J.flatten(2).transpose(1, 2)
+    g = (weighted @ residual.flatten(1).unsqueeze(-1)).squeeze(-1)
     return NormalEquations(cost, H, g)
 
 
@@ -227,6 +226,8 @@ def project_in_frame(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Project ``frame.origin + frame.size * (T_local @ points_local)``, with derivatives.
 
+    Points come last in what is returned: operations on many points for a few coordinates are fast that way.
+
     Args:
         T_local: (B, 4, 4).
         points_local: (B, N, 3).
@@ -234,23 +235,23 @@ def project_in_frame(
         frame: where the local frame lies.
 
     Returns:
-        Pixels (B, N, 2), depths (B, N) in mesh units, and the derivatives (B, N, 2, 6) of the pixels in δ for
+        Pixels (B, 2, N), depths (B, N) in mesh units, and the derivatives (B, 6, 2, N) of the pixels in δ for
         ``T_local ← exp(δ) @ T_local``. Where the depth is not positive, pixels and derivatives are finite but mean
         nothing. Differentiable w.r.t. all tensors.
     """
-    rotated = transform_points(T_local, points_local)
-    points_camera = frame.origin.unsqueeze(-2) + frame.size.unsqueeze(-1) * rotated
-    x, y, depth = points_camera.unbind(-1)
+    rotated = torch.baddbmm(T_local[:, :3, 3:], T_local[:, :3, :3], points_local.transpose(1, 2))
+    points_camera = frame.origin.unsqueeze(-1) + frame.size.unsqueeze(-1) * rotated
+    depth = points_camera[:, 2:]
     inverse = 1.0 / torch.where(depth > 0, depth, torch.ones_like(depth))
-    plane = torch.stack([x * inverse, y * inverse], dim=-1)
-    focal = K[:, None, :2, :2]
-    pixels = (focal @ plane.unsqueeze(-1)).squeeze(-1) + K[:, None, :2, 2]
-    # d plane / d points_camera, then d points_camera / d δ = size [I, −[rotated]×].
-    zero = torch.zeros_like(inverse)
-    columns = [inverse, zero, -plane[..., 0] * inverse, zero, inverse, -plane[..., 1] * inverse]
-    by_point = focal @ torch.stack(columns, dim=-1).unflatten(-1, (2, 3)) * frame.size[..., None, None]
-    by_rotation = torch.linalg.cross(rotated.unsqueeze(-2).expand_as(by_point), by_point, dim=-1)
-    return pixels, depth, torch.cat([by_point, by_rotation], dim=-1)
+    centre, focal = K[:, :2, 2:], K[:, :2, :2]
+    from_centre = focal @ (points_camera[:, :2] * inverse)
+    # d pixels / d points_camera times size, then d points_camera / d δ = size [I, −[rotated]×].
+    scaled = inverse * frame.size.unsqueeze(-1)
+    by_plane = focal.transpose(1, 2).unsqueeze(-1) * scaled.unsqueeze(1)
+    by_depth = from_centre * -scaled
+    by_point = torch.cat([by_plane, by_depth.unsqueeze(1)], dim=1)  # (B, 3, 2, N)
+    by_rotation = torch.linalg.cross(rotated.unsqueeze(2).expand_as(by_point), by_point, dim=1)
+    return from_centre + centre, depth.squeeze(1), torch.cat([by_point, by_rotation], dim=1)
 
 
 def check_correspondences(

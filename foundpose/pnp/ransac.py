@@ -15,6 +15,10 @@ from foundpose.pnp.scoring import reprojection_errors, select_inliers
 from foundpose.pnp.soft_selection import PoseCandidates, SoftInlierSelection
 from foundpose.pnp.weak_perspective import mirrored_poses
 
+# Decrease of the cost, as a share of it, that ends a polish whose inliers will be selected anew: it moves the pose by
+# far less than the noise does.
+_ROUGH = 1e-4
+
 
 class PnpStatus(IntEnum):
     """What became of a problem.
@@ -81,8 +85,10 @@ class RansacPnp(nn.Module):
         soft_selection: also return the best hypotheses with the probability of choosing them, for losses on the
             expected pose error (DSAC). The pose returned is the same as without.
         seed: seed of the samples.
-        chunk: samples solved and scored at once; bounds the memory to about 30 · B · chunk · N numbers, and
-            sampling stops at its multiples.
+        score_points: at most this many correspondences of a problem, evenly spread, score its samples; None means
+            all. The polish and the inliers returned are always those of all correspondences.
+        chunk: samples of a problem solved and scored at once; bounds the memory to about B · chunk · (4 N + 300)
+            numbers. None chooses by the batch and the device. It has no influence on the result.
 
     Source: paper, section "Pose estimation from 2D-3D correspondences"; Fischler and Bolles, "Random sample
     consensus", 1981; the local optimisation follows Chum, Matas and Kittler, "Locally optimized RANSAC", 2003.
@@ -102,12 +108,15 @@ class RansacPnp(nn.Module):
         polish: GaussNewtonPnp | None = None,
         soft_selection: SoftInlierSelection | None = None,
         seed: int = 0,
-        chunk: int = 50,
+        score_points: int | None = 256,
+        chunk: int | None = None,
     ) -> None:
         super().__init__()
         check_solver(solver)
-        if iterations < 1 or chunk < 1:
+        if iterations < 1 or (chunk is not None and chunk < 1):
             raise ValueError(f"iterations and chunk must be at least 1, got {iterations} and {chunk}")
+        if score_points is not None and score_points < SAMPLE_SIZE:
+            raise ValueError(f"score_points must be at least {SAMPLE_SIZE} or None, got {score_points}")
         if not threshold > 0:
             raise ValueError(f"threshold must be positive (pixels), got {threshold}")
         if min_inliers < SAMPLE_SIZE:
@@ -124,6 +133,7 @@ class RansacPnp(nn.Module):
         self.mirror = mirror
         self.polish = GaussNewtonPnp(max_iterations=10) if polish is None else polish
         self.soft_selection = soft_selection
+        self.score_points = score_points
         self.chunk = chunk
         generator = torch.Generator().manual_seed(seed)
         # Integers, so that every device turns them into the same indices.
@@ -243,6 +253,7 @@ class RansacPnp(nn.Module):
             threshold=self.threshold,
             confidence=self.confidence,
             chunk=self.chunk,
+            score_points=self.score_points,
             keep=1 if self.soft_selection is None else self.soft_selection.num_candidates,
         )
 
@@ -251,7 +262,7 @@ class RansacPnp(nn.Module):
         have a gradient (P,)."""
         unrolled = self.polish.differentiation == "unrolled" and torch.is_grad_enabled()
         with torch.set_grad_enabled(unrolled):
-            rounds = self.polish_rounds
+            rounds = self.polish_rounds - 1
             state = self._climb(_Polished(T, *self._select(T, problem)), found, problem, rounds)
             if self.mirror:
                 mirrored = mirrored_poses(state.T, problem.points_model, problem.weigh(state.inliers))
@@ -261,6 +272,8 @@ class RansacPnp(nn.Module):
                 other = self._climb(start, alike, problem, min(rounds, 1))
                 better = alike & (other.cost < state.cost)
                 state = self._climb(_where(better, other, state), better, problem, rounds - 1)
+            if self.polish_rounds > 0:
+                state, _ = self._polish_once(state, found, problem, tolerance=None)
         T, regular = state.T, torch.ones_like(found)
         if torch.is_grad_enabled() and not unrolled:
             # The optimum is that of the inliers polished on, which the last selection may have changed.
@@ -274,22 +287,32 @@ class RansacPnp(nn.Module):
         return inliers, inliers, cost
 
     def _climb(self, state: "_Polished", active: Tensor, problem: "_Problem", rounds: int) -> "_Polished":
-        """Polish on the inliers and select them anew, in turns, as long as that lowers the truncated cost."""
-        # Below four inliers there is nothing to polish on.
-        active = active & (state.inliers.sum(-1) >= SAMPLE_SIZE)
+        """Polish roughly on the inliers and select them anew, in turns, as long as they change."""
         for _ in range(rounds):
             rows = active.nonzero().squeeze(-1)
             if rows.numel() == 0:
                 break
-            part, before = problem.take(rows), _Polished(*(x[rows] for x in state))
-            T = self.polish.optimise(before.T, *part[:3], part.weigh(before.inliers))[0].T
-            inliers, _, cost = self._select(T, part)
-            better = (inliers.sum(-1) >= SAMPLE_SIZE) & (cost <= before.cost)
-            after = _where(better, _Polished(T, inliers, before.inliers, cost), before)
+            before = _Polished(*(x[rows] for x in state))
+            after, better = self._polish_once(before, active[rows], problem.take(rows), _ROUGH)
             state = _Polished(*(x.index_copy(0, rows, y) for x, y in zip(state, after, strict=True)))
-            # A problem takes part as long as its inliers change.
-            active = active.index_copy(0, rows, better & (inliers != before.inliers).any(-1))
+            changed = (after.inliers != before.inliers).any(-1)
+            active = active.index_copy(0, rows, better & changed)
         return state
+
+    def _polish_once(
+        self, before: "_Polished", active: Tensor, problem: "_Problem", tolerance: float | None
+    ) -> tuple["_Polished", Tensor]:
+        """Polish poses on their inliers, and select these anew, where that does not raise the truncated cost (P,)."""
+        T = self.polish.optimise(before.T, *problem[:3], problem.weigh(before.inliers), tolerance=tolerance)[
+            0
+        ].T
+        inliers, _, cost = self._select(T, problem)
+        # Equal but for rounding counts as equal, or rounding would decide whether the last polish is kept.
+        most = before.cost * (1.0 + 64.0 * torch.finfo(cost.dtype).eps)
+        # Below four inliers there is nothing to polish on.
+        enough = torch.minimum(inliers.sum(-1), before.inliers.sum(-1)) >= SAMPLE_SIZE
+        better = active & enough & (cost <= most)
+        return _where(better, _Polished(T, inliers, before.inliers, cost), before), better
 
 
 class _Problem(NamedTuple):

@@ -1,7 +1,7 @@
 """Hypotheses from random minimal samples."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Literal, NamedTuple
 
 import torch
@@ -14,6 +14,8 @@ from foundpose.pnp.p3p import solve_p3p_rays
 from foundpose.pnp.scoring import score_poses
 
 SAMPLE_SIZE = 4
+# A sample of inliers only may still be a poor one, through their noise: this many are drawn whatever the confidence.
+_LEAST_SAMPLES = 50
 
 SolverName = Literal["epnp", "p3p"]
 
@@ -79,7 +81,8 @@ def sample_hypotheses(
     solver: SolverName,
     threshold: float,
     confidence: float | None,
-    chunk: int,
+    chunk: int | None = None,
+    score_points: int | None = None,
     keep: int = 1,
 ) -> Hypotheses:
     """Solve and score minimal samples until each problem has had enough.
@@ -93,53 +96,166 @@ def sample_hypotheses(
         draws: (I, 4) integers in [0, 2³¹), the same for all problems.
         solver: minimal solver.
         threshold: of an inlier, pixels.
-        confidence: stop a problem once an all-inlier sample has been drawn with this probability; None never stops.
-        chunk: samples solved at once.
+        confidence: a problem's samples count until an all-inlier sample has been drawn with this probability (and 50
+            in any case); None means that all count.
+        chunk: samples solved at once; None chooses. It has no influence on the result.
+        score_points: at most this many correspondences of a problem, evenly spread, score the samples; None means all.
         keep: number J of hypotheses to keep.
 
     Returns:
         The best hypotheses. Not differentiable: give it detached tensors.
     """
-    solve = _SOLVERS[solver]
-    batch = len(points_image)
-    rays = pixel_rays(points_image, K)
-    count = valid.sum(-1)
-    # Valid correspondences first, so that a rank among the valid ones becomes an index.
-    order = torch.argsort((~valid).to(torch.uint8), dim=-1, stable=True)
+    batch, points = valid.shape
     best_T = torch.eye(4, dtype=K.dtype, device=K.device).repeat(batch, keep, 1, 1)
     best_quality = K.new_full((batch, keep), -1.0)
     determined = torch.zeros_like(usable)
-    problems = usable.nonzero().squeeze(-1)
-    for first in range(0, len(draws), chunk):
-        if problems.numel() == 0:
-            break
-        ranks = distinct_ranks(draws[first : first + chunk], count[problems])
-        index = torch.take_along_dim(order[problems], ranks.flatten(1), dim=1).unsqueeze(-1)
-        pixels, model = points_image[problems], points_model[problems]
-        samples = ranks.shape[:2]
-        solution = solve(
-            torch.take_along_dim(rays[problems], index, dim=1).reshape(-1, SAMPLE_SIZE, 3),
-            torch.take_along_dim(model, index, dim=1).reshape(-1, SAMPLE_SIZE, 3),
-        )
-        T = solution.T_camera_from_model.unflatten(0, samples)
-        solved = solution.valid.unflatten(0, samples)
-        quality = score_poses(T, pixels, model, K[problems], valid[problems], threshold)
-        quality = torch.cat([best_quality[problems], quality.masked_fill(~solved, -1.0)], dim=1)
+    if batch == 0 or points < SAMPLE_SIZE:
+        return Hypotheses(best_T, best_quality, determined)
+    # Valid correspondences first, so that a rank among the valid ones becomes an index.
+    order = torch.argsort((~valid).to(torch.uint8), dim=-1, stable=True)
+    data = _Correspondences(
+        pixel_rays(points_image, K),
+        points_model,
+        K,
+        order,
+        valid.sum(-1),
+        *_scored_points(points_image, points_model, valid, order, score_points),
+    )
+    # All problems take part in the first chunk, also those that are not usable: to leave them out would cost a look.
+    rows: Tensor | None = None
+    first = 0
+    for size in _chunk_sizes(chunk, batch, len(draws), points_image.device):
+        mine = data if rows is None else data.take(rows)
+        samples = _solve_and_score(mine, draws[first : first + size], solver, threshold)
+        before = best_quality if rows is None else best_quality[rows]
+        before_T = best_T if rows is None else best_T[rows]
+        active = usable if rows is None else usable[rows]
+        quality = samples.quality.masked_fill(~active.unsqueeze(1), -1.0)
+        enough = None
+        if confidence is not None:
+            enough = _has_enough(before[:, :1], quality, first, mine.num_scored, confidence)
+            # A sample counts if those before it were not enough.
+            quality[:, 1:].masked_fill_(enough[:, :-1], -1.0)
+        known = (~samples.degenerate).any(1) & active
+        quality = torch.cat([before, quality], dim=1)
         # A stable sort: of equally good samples the first, on every device.
         quality, place = quality.sort(dim=1, descending=True, stable=True)
-        best_quality[problems] = quality[:, :keep]
-        best_T[problems] = torch.take_along_dim(
-            torch.cat([best_T[problems], T], dim=1), place[:, :keep, None, None], dim=1
-        )
-        determined[problems] |= (~solution.degenerate).unflatten(0, samples).any(-1)
-        if confidence is not None:
-            drawn = first + samples[1]
-            ratio = quality[:, 0].clamp(min=0.0).floor() / count[problems]
-            missed = drawn * torch.log1p(-ratio.clamp(max=1.0 - 1e-6).pow(SAMPLE_SIZE))
-            problems = problems[missed > math.log(1.0 - confidence)]
+        T = torch.take_along_dim(torch.cat([before_T, samples.T], dim=1), place[:, :keep, None, None], dim=1)
+        if rows is None:
+            best_quality, best_T, determined = quality[:, :keep], T, known
+        else:
+            best_quality = best_quality.index_copy(0, rows, quality[:, :keep])
+            best_T = best_T.index_copy(0, rows, T)
+            determined = determined.index_copy(0, rows, determined[rows] | known)
+        first += size
+        if first >= len(draws):
+            break
+        active = active if enough is None else active & ~enough[:, -1]
+        # The one look at the device's results in each chunk.
+        left = active.nonzero().squeeze(-1)
+        if left.numel() == 0:
+            break
+        rows = left if rows is None else rows[left]
     missing = best_quality < 0
     best_T = torch.where(missing[..., None, None], torch.eye(4, dtype=K.dtype, device=K.device), best_T)
     return Hypotheses(best_T, best_quality, determined)
+
+
+class _Correspondences(NamedTuple):
+    """What samples of P problems are drawn from and scored on."""
+
+    rays: Tensor
+    points_model: Tensor
+    K: Tensor
+    order: Tensor
+    count: Tensor
+    scored_image: Tensor
+    scored_model: Tensor
+    scored: Tensor
+    num_scored: Tensor
+
+    def take(self, rows: Tensor) -> "_Correspondences":
+        """Some of the problems."""
+        return _Correspondences(*(field[rows] for field in self))
+
+
+class _Samples(NamedTuple):
+    """Poses (P, I, 4, 4) of samples, their qualities (P, I), −1 where not valid, and which are degenerate (P, I)."""
+
+    T: Tensor
+    quality: Tensor
+    degenerate: Tensor
+
+
+def _chunk_sizes(chunk: int | None, batch: int, total: int, device: torch.device) -> Iterator[int]:
+    """Numbers of samples solved at once for each problem."""
+    if chunk is None:
+        # Few samples take as long as some more: operations cost more than numbers, up to what the cache holds.
+        least, most = (512, 4096) if device.type == "cpu" else (1 << 14, 1 << 16)
+        chunk, largest = max(least // batch, 32), max(most // batch, 32)
+    else:
+        largest = chunk
+    done = 0
+    while done < total:
+        size = min(chunk, total - done)
+        yield size
+        done += size
+        chunk = min(2 * chunk, largest)
+
+
+def _scored_points(
+    points_image: Tensor, points_model: Tensor, valid: Tensor, order: Tensor, most: int | None
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Pixels (B, M, 2), points (B, M, 3) and mask (B, M) of the correspondences that score, and their number (B,)."""
+    count = valid.sum(-1)
+    if most is None or most >= valid.shape[1]:
+        return points_image, points_model, valid, count
+    place = torch.arange(most, device=valid.device)
+    number = count.clamp(max=most)
+    # Evenly spread over the valid ones, which come in the order of the image's rows.
+    rank = (place * count.unsqueeze(1)) // number.clamp(min=1).unsqueeze(1)
+    index = order.gather(1, rank.clamp(max=valid.shape[1] - 1)).unsqueeze(-1)
+    return (
+        torch.take_along_dim(points_image, index, dim=1),
+        torch.take_along_dim(points_model, index, dim=1),
+        place < number.unsqueeze(1),
+        number,
+    )
+
+
+def _solve_and_score(data: _Correspondences, draws: Tensor, solver: SolverName, threshold: float) -> _Samples:
+    """Poses of samples and their qualities."""
+    ranks = distinct_ranks(draws, data.count.clamp(min=SAMPLE_SIZE))
+    index = torch.take_along_dim(data.order, ranks.flatten(1), dim=1).unsqueeze(-1)
+    solution = _SOLVERS[solver](
+        torch.take_along_dim(data.rays, index, dim=1).reshape(-1, SAMPLE_SIZE, 3),
+        torch.take_along_dim(data.points_model, index, dim=1).reshape(-1, SAMPLE_SIZE, 3),
+    )
+    samples = ranks.shape[:2]
+    T = solution.T_camera_from_model.unflatten(0, samples)
+    quality = score_poses(T, data.scored_image, data.scored_model, data.K, data.scored, threshold)
+    return _Samples(
+        T,
+        quality.masked_fill(~solution.valid.unflatten(0, samples), -1.0),
+        solution.degenerate.unflatten(0, samples),
+    )
+
+
+def _has_enough(before: Tensor, quality: Tensor, first: int, num_scored: Tensor, confidence: float) -> Tensor:
+    """Whether, after each of further samples (P, I), one with inliers only has been drawn with that probability.
+
+    Args:
+        before: (P, 1) best quality before these samples.
+        quality: (P, I).
+        first: number of samples before these.
+        num_scored: (P,) number of correspondences that the qualities count.
+        confidence: the probability.
+    """
+    best = torch.maximum(quality.cummax(dim=1).values, before)
+    ratio = best.clamp(min=0.0).floor() / num_scored.clamp(min=1).unsqueeze(1)
+    drawn = torch.arange(first + 1, first + 1 + quality.shape[1], device=quality.device)
+    missed = drawn * torch.log1p(-ratio.clamp(max=1.0 - 1e-6).pow(SAMPLE_SIZE))
+    return (missed <= math.log(1.0 - confidence)) & (drawn >= _LEAST_SAMPLES)
 
 
 def distinct_ranks(draws: Tensor, count: Tensor) -> Tensor:

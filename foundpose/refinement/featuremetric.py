@@ -168,14 +168,14 @@ class FeaturemetricAlignment(nn.Module):
             frame = LocalFrame.at(start, problem.points_model.detach(), valid.to(T.dtype))
         else:
             frame = LocalFrame.at(start, problem.points_model, valid.to(T.dtype))
-        points_local = frame.points(problem.points_model)
+        goal = _Goal.of(problem, frame)
         start_local = frame.pose_to_local(start)
-        unit = self._unit(start_local, points_local, problem, frame)
+        unit = self._unit(start_local, goal)
         descriptors = problem.descriptors.detach()
         ceiling = self._ceiling(descriptors if unit is None else descriptors * unit[:, None, None])
 
         def evaluate(T_local: Tensor) -> NormalEquations:
-            return self._equations(T_local, points_local, problem, frame, unit, ceiling)[0]
+            return self._equations(T_local, goal, unit, ceiling)[0]
 
         result = optimise_pose(
             evaluate,
@@ -184,7 +184,8 @@ class FeaturemetricAlignment(nn.Module):
             max_iterations=self.max_iterations,
             tolerance=self.tolerance,
         )
-        seen = self._equations(result.T.detach(), points_local, problem, frame, unit, ceiling)
+        with torch.no_grad():
+            seen = self._equations(result.T, goal, unit, ceiling)
         improved = ~result.failed & (result.cost < result.initial_cost)
         T_aligned = frame.pose_from_local(result.T)
         # A start that is the optimum already keeps its value to the bit, but has the optimum's gradient.
@@ -210,17 +211,15 @@ class FeaturemetricAlignment(nn.Module):
         assert isinstance(self.loss, BarronLoss | Huber)
         return self.loss.scale
 
-    def _unit(
-        self, T_local: Tensor, points_local: Tensor, problem: AlignmentProblem, frame: LocalFrame
-    ) -> Tensor | None:
+    def _unit(self, T_local: Tensor, goal: "_Goal") -> Tensor | None:
         """Factors (n,) that bring residuals to the loss's unit; None without an automatic scale."""
         if not self.auto_scale:
             return None
         with torch.no_grad():
-            residual, _, seen, _ = _residuals(T_local, points_local, problem, frame, self.interpolation)
-            size = residual.abs()
+            rows, seen, _ = _residual_rows(T_local, goal, self.interpolation)
+            size = rows[:, :, 0].abs()
             if self.residual == "norm":
-                size = torch.linalg.vector_norm(residual, dim=-1, keepdim=True)
+                size = torch.linalg.vector_norm(size, dim=-1, keepdim=True)
             size = size.masked_fill(~seen.unsqueeze(-1), torch.nan).flatten(1)
             spread = 1.4826 * size.nanmedian(dim=1).values
             scale = torch.as_tensor(self._loss_scale(), dtype=spread.dtype, device=spread.device)
@@ -238,33 +237,29 @@ class FeaturemetricAlignment(nn.Module):
         return self.loss(squared)[0].sum(-1)
 
     def _equations(
-        self,
-        T_local: Tensor,
-        points_local: Tensor,
-        problem: AlignmentProblem,
-        frame: LocalFrame,
-        unit: Tensor | None,
-        ceiling: Tensor,
+        self, T_local: Tensor, goal: "_Goal", unit: Tensor | None, ceiling: Tensor
     ) -> tuple[NormalEquations, Tensor, Tensor]:
         """Normal equations of ½ mean ρ; weighted sum of squared residuals (n,) and sum of weights (n,)."""
-        residual, slopes, seen, J = _residuals(T_local, points_local, problem, frame, self.interpolation)
+        rows, seen, J = _residual_rows(T_local, goal, self.interpolation)
         if unit is not None:
-            residual, slopes = residual * unit[:, None, None], slopes * unit[:, None, None, None]
-        squared = residual.square()
+            rows = rows * unit[:, None, None, None]
+        squared = rows[:, :, 0].square()
         if self.residual == "norm":
             squared = squared.sum(-1, keepdim=True)
         rho, weight = self.loss(squared)
-        count = problem.valid.sum(-1).clamp(min=1).to(rho.dtype)
-        lost = problem.valid & ~seen
+        valid = goal.problem.valid
+        count = valid.sum(-1).clamp(min=1).to(rho.dtype)
+        lost = valid & ~seen
         cost = torch.where(seen, rho.sum(-1), torch.where(lost, ceiling, torch.zeros_like(ceiling)))
         weight = weight * (seen / count.unsqueeze(-1)).unsqueeze(-1)
-        # Two rows a patch, however many channels there are.
-        weighted = slopes * weight.unsqueeze(-2)
-        gram = weighted @ slopes.transpose(-1, -2)  # (n, P, 2, 2)
-        pull = (weighted @ residual.unsqueeze(-1)).squeeze(-1)  # (n, P, 2)
-        H = (gram @ J).flatten(1, 2).transpose(-1, -2) @ J.flatten(1, 2)
-        g = (J.flatten(1, 2).transpose(-1, -2) @ pull.flatten(1).unsqueeze(-1)).squeeze(-1)
-        energy = (weight * squared).sum((-1, -2)).detach()
+        # All channels of a patch come down to the products of its three rows.
+        products = (rows * weight.unsqueeze(2)).flatten(0, 1) @ rows.flatten(0, 1).transpose(1, 2)
+        products = products.unflatten(0, valid.shape).permute(0, 2, 3, 1)  # (n, 3, 3, P)
+        gram, pull = products[:, 1:, 1:], products[:, 1:, 0]
+        weighted = (J * gram[:, None, 0]).sum(2), (J * gram[:, None, 1]).sum(2)
+        H = torch.stack(weighted, dim=2).flatten(2) @ J.flatten(2).transpose(1, 2)
+        g = (J.flatten(2) @ pull.flatten(1).unsqueeze(-1)).squeeze(-1)
+        energy = products[:, 0, 0].sum(-1).detach()
         return NormalEquations(0.5 * cost.sum(-1) / count, H, g), energy, weight.sum((-1, -2)).detach()
 
     def extra_repr(self) -> str:
@@ -276,24 +271,44 @@ class FeaturemetricAlignment(nn.Module):
         )
 
 
-def _residuals(
-    T_local: Tensor,
-    points_local: Tensor,
-    problem: AlignmentProblem,
-    frame: LocalFrame,
-    interpolation: Interpolation,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Residuals (n, P, d), their slopes along columns and rows of the map (n, P, 2, d), which patches are seen
-    (n, P), and derivatives of the map's coordinates in the pose (n, P, 2, 6)."""
-    pixels, depth, J = project_in_frame(T_local, points_local, problem.K, frame)
-    inside = ((pixels >= -0.5) & (pixels <= problem.image_size - 0.5)).all(-1)
+class _Goal(NamedTuple):
+    """What poses are aligned with, in the frame that they are optimised in.
+
+    Attributes:
+        problem: as given.
+        frame: the local frames.
+        points_local: (n, P, 3).
+        minus_descriptors: (n, P, 3, d): minus the descriptors, and two rows of zeros.
+    """
+
+    problem: AlignmentProblem
+    frame: LocalFrame
+    points_local: Tensor
+    minus_descriptors: Tensor
+
+    @classmethod
+    def of(cls, problem: AlignmentProblem, frame: LocalFrame) -> "_Goal":
+        """A problem in a frame."""
+        rows = nn.functional.pad(-problem.descriptors.unsqueeze(2), (0, 0, 0, 2))
+        return cls(problem, frame, frame.points(problem.points_model), rows)
+
+
+def _residual_rows(
+    T_local: Tensor, goal: _Goal, interpolation: Interpolation
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Residuals of patches and their slopes along columns and rows of the map (n, P, 3, d), which patches are seen
+    (n, P), and derivatives of the map's coordinates in the pose (n, 6, 2, P)."""
+    problem = goal.problem
+    pixels, depth, J = project_in_frame(T_local, goal.points_local, problem.K, goal.frame)
+    inside = ((pixels >= -0.5) & (pixels <= problem.image_size - 0.5)).all(1)
     seen = problem.valid & (depth > 0) & inside
-    pixels = torch.where(seen.unsqueeze(-1), pixels, torch.zeros_like(pixels))
-    position = (pixels - problem.offset) / problem.stride
-    sampled = sample_features(problem.features, problem.map_index, position, interpolation)
-    residual = sampled[..., 0, :] - problem.descriptors
-    J = torch.where(seen[..., None, None], J, torch.zeros_like(J)) / problem.stride
-    return residual, sampled[..., 1:, :], seen, J
+    pixels = torch.where(seen.unsqueeze(1), pixels, torch.zeros_like(pixels))
+    position = ((pixels - problem.offset) / problem.stride).transpose(1, 2)
+    rows = sample_features(
+        problem.features, problem.map_index, position, interpolation, goal.minus_descriptors
+    )
+    J = torch.where(seen[:, None, None], J, torch.zeros_like(J)) / problem.stride
+    return rows, seen, J
 
 
 def _covariance(H: Tensor, energy: Tensor, weights: Tensor, count: Tensor, frame: LocalFrame) -> Tensor:

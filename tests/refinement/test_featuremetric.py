@@ -9,6 +9,7 @@ from foundpose.geometry.transforms import rotation_angle, se3_exp
 from foundpose.optimization import BarronLoss, Huber, LeastSquares
 from foundpose.pnp.polish import LocalFrame
 from foundpose.refinement import AlignmentProblem, FeaturemetricAlignment
+from foundpose.refinement.featuremetric import _Goal
 from tests.refinement.problems import OFFSET, SIZE, STRIDE, cast, make_problem, perturb
 
 SETTINGS = [
@@ -29,10 +30,10 @@ def build(**settings) -> FeaturemetricAlignment:
 def local_equations(module: FeaturemetricAlignment, T: Tensor, problem: AlignmentProblem):
     """The module's equations as a function of the local pose, and the local pose itself."""
     frame = LocalFrame.at(T, problem.points_model, problem.valid.double())
-    points = frame.points(problem.points_model)
+    goal = _Goal.of(problem, frame)
     ceiling = module._ceiling(problem.descriptors)
     return (
-        lambda T_local: module._equations(T_local, points, problem, frame, None, ceiling)[0],
+        lambda T_local: module._equations(T_local, goal, None, ceiling)[0],
         frame.pose_to_local(T),
     )
 
