@@ -76,8 +76,8 @@ def se3_exp(twist: Tensor) -> Tensor:
 def _exponential_coefficients(squared: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """sin θ / θ, (1 − cos θ) / θ² and (θ − sin θ) / θ³ of squared angles θ², smooth through zero."""
     small = squared < _SMALL_SQUARED_ANGLE
-    near = torch.where(small, squared, torch.zeros_like(squared))
-    far = torch.where(small, torch.ones_like(squared), squared)
+    near = torch.where(small, squared, 0.0)
+    far = torch.where(small, 1.0, squared)
     angle = far.sqrt()
     B = torch.where(small, _alternating_series(near, 2), (1.0 - angle.cos()) / far)
     C = torch.where(small, _alternating_series(near, 3), (angle - angle.sin()) / (far * angle))
@@ -85,9 +85,10 @@ def _exponential_coefficients(squared: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _alternating_series(s: Tensor, first: int) -> Tensor:
-    """Σ (−s)ᵏ / (2k + first)! to the precision of float64 for s below the limit above."""
-    total = torch.full_like(s, 1.0 / math.factorial(10 + first))
-    for k in range(4, -1, -1):
+    """Σ (−s)ᵏ / (2k + first)! to rounding for s below the limit above."""
+    last = 5 if s.dtype == torch.float64 else 3
+    total = torch.full_like(s, 1.0 / math.factorial(2 * last + first))
+    for k in range(last - 1, -1, -1):
         total = 1.0 / math.factorial(2 * k + first) - s * total
     return total
 

@@ -133,7 +133,8 @@ def levenberg_marquardt(
 
 
 def _finite(cost: Tensor, H: Tensor, g: Tensor) -> Tensor:
-    return torch.isfinite(cost) & torch.isfinite(H).all(-1).all(-1) & torch.isfinite(g).all(-1)
+    # A sum is finite only if all its terms are.
+    return torch.isfinite(cost + H.detach().sum((-1, -2)) + g.detach().sum(-1))
 
 
 def _solve(H: Tensor, g: Tensor, damping: Tensor) -> tuple[Tensor, Tensor]:
@@ -142,16 +143,18 @@ def _solve(H: Tensor, g: Tensor, damping: Tensor) -> tuple[Tensor, Tensor]:
     usable = _finite(damping, H, g) & (diagonal.amax(-1) > 0)
     # Unit matrices stand in for unusable systems, so that no NaN enters the graph.
     H = torch.where(usable[:, None, None], H, torch.eye(6, dtype=H.dtype, device=H.device))
-    g = torch.where(usable[:, None], g, torch.zeros_like(g))
+    g = torch.where(usable[:, None], g, 0.0)
     diagonal = H.diagonal(dim1=-2, dim2=-1)
     smallest = torch.finfo(H.dtype).eps * diagonal.amax(-1, keepdim=True)
     scaling = torch.maximum(diagonal, smallest)
     # Solving in the scaled variables keeps the condition number free of the units.
     root = scaling.sqrt()
     scaled = H / (root[:, :, None] * root[:, None, :]) + torch.diag_embed(damping[:, None].expand_as(root))
-    solved = usable & (torch.linalg.cholesky_ex(scaled.detach()).info == 0)
-    # Not after the factorisation, whose derivative would be NaN where it fails.
-    identity = torch.eye(6, dtype=H.dtype, device=H.device)
-    factor = torch.linalg.cholesky_ex(torch.where(solved[:, None, None], scaled, identity)).L
+    factor, info = torch.linalg.cholesky_ex(scaled.detach())
+    solved = usable & (info == 0)
+    if torch.is_grad_enabled():
+        # Its derivative would be NaN where it fails.
+        identity = torch.eye(6, dtype=H.dtype, device=H.device)
+        factor = torch.linalg.cholesky_ex(torch.where(solved[:, None, None], scaled, identity)).L
     step = -torch.cholesky_solve((g / root).unsqueeze(-1), factor).squeeze(-1) / root
-    return torch.where(solved[:, None], step, torch.zeros_like(step)), solved
+    return torch.where(solved[:, None], step, 0.0), solved

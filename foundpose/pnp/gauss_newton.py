@@ -143,10 +143,11 @@ class GaussNewtonPnp(nn.Module):
         K: Tensor,
         weights: Tensor | None = None,
         tolerance: float | None = None,
+        max_iterations: int | None = None,
     ) -> tuple[LevenbergMarquardtResult, LocalFrame]:
         """What :meth:`forward` does, without the covariance; see :func:`polish_pnp` for what is returned.
 
-        ``tolerance`` takes the place of this module's own.
+        ``tolerance`` takes the place of this module's own, and ``max_iterations`` lowers it.
         """
         return polish_pnp(
             T_camera_from_model,
@@ -155,7 +156,7 @@ class GaussNewtonPnp(nn.Module):
             K,
             weights,
             loss=self.loss,
-            max_iterations=self.max_iterations,
+            max_iterations=min(self.max_iterations, max_iterations or self.max_iterations),
             tolerance=self.tolerance if tolerance is None else tolerance,
             differentiation=self.differentiation,
         )

@@ -15,9 +15,10 @@ from foundpose.pnp.scoring import reprojection_errors, select_inliers
 from foundpose.pnp.soft_selection import PoseCandidates, SoftInlierSelection
 from foundpose.pnp.weak_perspective import mirrored_poses
 
-# Decrease of the cost, as a share of it, that ends a polish whose inliers will be selected anew: it moves the pose by
-# far less than the noise does.
-_ROUGH = 1e-4
+# Decrease of the cost, as a share of it, whose step is the last of a polish whose inliers will be selected anew.
+_ROUGH = 1e-2
+# Steps that a mirrored pose is given to show that it is the better one.
+_MIRROR_STEPS = 4
 
 
 class PnpStatus(IntEnum):
@@ -269,11 +270,11 @@ class RansacPnp(nn.Module):
                 start = _Polished(mirrored, *self._select(mirrored, problem))
                 # A solid object does not look like its mirror image: most problems end here.
                 alike = found & (2 * start.inliers.sum(-1) >= state.inliers.sum(-1))
-                other = self._climb(start, alike, problem, min(rounds, 1))
+                other = self._climb(start, alike, problem, min(rounds, 1), _MIRROR_STEPS)
                 better = alike & (other.cost < state.cost)
                 state = self._climb(_where(better, other, state), better, problem, rounds - 1)
             if self.polish_rounds > 0:
-                state, _ = self._polish_once(state, found, problem, tolerance=None)
+                state, _ = self._polish_once(state, found, problem)
         T, regular = state.T, torch.ones_like(found)
         if torch.is_grad_enabled() and not unrolled:
             # The optimum is that of the inliers polished on, which the last selection may have changed.
@@ -286,21 +287,33 @@ class RansacPnp(nn.Module):
         inliers, cost = select_inliers(T, *problem[:4], self.threshold, problem.weights, self.polish.loss)
         return inliers, inliers, cost
 
-    def _climb(self, state: "_Polished", active: Tensor, problem: "_Problem", rounds: int) -> "_Polished":
+    def _climb(
+        self,
+        state: "_Polished",
+        active: Tensor,
+        problem: "_Problem",
+        rounds: int,
+        steps: int | None = None,
+    ) -> "_Polished":
         """Polish roughly on the inliers and select them anew, in turns, as long as they change."""
         for _ in range(rounds):
             rows = active.nonzero().squeeze(-1)
             if rows.numel() == 0:
                 break
             before = _Polished(*(x[rows] for x in state))
-            after, better = self._polish_once(before, active[rows], problem.take(rows), _ROUGH)
+            after, better = self._polish_once(before, active[rows], problem.take(rows), _ROUGH, steps)
             state = _Polished(*(x.index_copy(0, rows, y) for x, y in zip(state, after, strict=True)))
             changed = (after.inliers != before.inliers).any(-1)
             active = active.index_copy(0, rows, better & changed)
         return state
 
     def _polish_once(
-        self, before: "_Polished", active: Tensor, problem: "_Problem", tolerance: float | None
+        self,
+        before: "_Polished",
+        active: Tensor,
+        problem: "_Problem",
+        tolerance: float | None = None,
+        steps: int | None = None,
     ) -> tuple["_Polished", Tensor]:
         """Polish poses on their inliers, and select these anew, where that does not raise the truncated cost (P,)."""
         T = self.polish.optimise(before.T, *problem[:3], problem.weigh(before.inliers), tolerance=tolerance)[

@@ -99,7 +99,7 @@ def sample_hypotheses(
         confidence: a problem's samples count until an all-inlier sample has been drawn with this probability (and 50
             in any case); None means that all count.
         chunk: samples solved at once; None chooses. It has no influence on the result.
-        score_points: at most this many correspondences of a problem, evenly spread, score the samples; None means all.
+        score_points: at most this many correspondences of a problem, evenly spread, score the samples; None: all.
         keep: number J of hypotheses to keep.
 
     Returns:
@@ -168,7 +168,7 @@ class _Correspondences(NamedTuple):
     points_model: Tensor
     K: Tensor
     order: Tensor
-    count: Tensor
+    num_valid: Tensor
     scored_image: Tensor
     scored_model: Tensor
     scored: Tensor
@@ -191,7 +191,7 @@ def _chunk_sizes(chunk: int | None, batch: int, total: int, device: torch.device
     """Numbers of samples solved at once for each problem."""
     if chunk is None:
         # Few samples take as long as some more: operations cost more than numbers, up to what the cache holds.
-        least, most = (512, 4096) if device.type == "cpu" else (1 << 14, 1 << 16)
+        least, most = (1024, 4096) if device.type == "cpu" else (1 << 14, 1 << 16)
         chunk, largest = max(least // batch, 32), max(most // batch, 32)
     else:
         largest = chunk
@@ -225,7 +225,7 @@ def _scored_points(
 
 def _solve_and_score(data: _Correspondences, draws: Tensor, solver: SolverName, threshold: float) -> _Samples:
     """Poses of samples and their qualities."""
-    ranks = distinct_ranks(draws, data.count.clamp(min=SAMPLE_SIZE))
+    ranks = distinct_ranks(draws, data.num_valid.clamp(min=SAMPLE_SIZE))
     index = torch.take_along_dim(data.order, ranks.flatten(1), dim=1).unsqueeze(-1)
     solution = _SOLVERS[solver](
         torch.take_along_dim(data.rays, index, dim=1).reshape(-1, SAMPLE_SIZE, 3),

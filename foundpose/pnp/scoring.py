@@ -27,8 +27,8 @@ def score_poses(
     Returns:
         (B, S) qualities; their integer part is the count. Not differentiable: give it detached tensors.
     """
-    # The hottest loop of RANSAC: few passes over (B, S, N) numbers, in place. Masks are numbers, as comparisons to bool
-    # and masked writes take a CPU ten times as long. Products are written out for the reason given in
+    # The hottest loop of RANSAC: few passes over (B, S, N) numbers, in place. Masks are numbers, as comparisons to
+    # bool and masked writes take a CPU ten times as long. Products are written out for the reason given in
     # :func:`reprojection_errors`.
     points = points_model.transpose(1, 2).contiguous().unsqueeze(2).unbind(1)
     observed = points_image.transpose(1, 2).contiguous().unsqueeze(2).unbind(1)
