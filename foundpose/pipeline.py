@@ -8,6 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from foundpose.devices import indices_on
 from foundpose.estimates import (
     Correspondences,
     PoseEstimates,
@@ -205,13 +206,13 @@ class FoundPose(nn.Module):
         parts = []
         for representation, crop_index in zip(objects, members, strict=True):
             if len(crop_index) > 0:
-                rows = crop_index.to(raw.valid.device)
+                rows = indices_on(raw.valid.device, crop_index)
                 parts.append(self._search_object(representation, take_rows(raw, rows), crops, rows))
         # Back to the order of the batch.
         order = torch.cat(members).argsort()
 
         def join(fields: list[Tensor]) -> Tensor:
-            return torch.cat(fields)[order.to(fields[0].device)]
+            return torch.cat(fields)[indices_on(fields[0].device, order)]
 
         queries, retrieved, found = zip(*parts, strict=True)
         return combine(queries, join), combine(retrieved, join), combine(found, join)

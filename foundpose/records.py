@@ -14,25 +14,43 @@ def pose_records(estimates: PoseEstimates) -> list[dict[str, Any]]:
     """One record per estimate, of numbers and lists that JSON can hold.
 
     Args:
-        estimates: poses of B crops, on any device (read field by field, not crop by crop).
+        estimates: poses of B crops, on any device (read at once).
 
     Returns:
         B records: ``valid``, ``status`` (name), ``score``, ``num_inliers``, ``num_patches`` of the crop, ``R`` (3
         rows) and ``t`` (mesh units) of the pose in the camera's frame, ``templates`` with their ``similarities``, and
         the ``best`` of them.
     """
-    T = estimates.T_camera_from_model.double().cpu()
+    T, templates = estimates.T_camera_from_model, estimates.templates
+    fields = [
+        estimates.valid,
+        estimates.status,
+        estimates.score,
+        estimates.num_inliers,
+        estimates.query.valid.sum(dim=1),
+        estimates.best,
+        T[:, :3, :3].flatten(1),
+        T[:, :3, 3],
+        templates.index,
+        templates.similarity.nan_to_num(neginf=-1.0),
+    ]
+    # One transfer; double precision holds all of these numbers as they are.
+    rows = torch.cat([x.detach().double().reshape(len(T), -1) for x in fields], dim=1).cpu()
+    h = templates.index.shape[1]
+    valid, status, score, num_inliers, num_patches, best, R, t, index, similarity = rows.split(
+        [1, 1, 1, 1, 1, 1, 9, 3, h, h], dim=1
+    )
     columns = {
-        "valid": estimates.valid.tolist(),
-        "status": [PoseStatus(code).name for code in estimates.status.tolist()],
-        "score": estimates.score.tolist(),
-        "num_inliers": estimates.num_inliers.tolist(),
-        "num_patches": estimates.query.valid.sum(dim=1).tolist(),
-        "R": T[:, :3, :3].tolist(),
-        "t": T[:, :3, 3].tolist(),
-        "templates": estimates.templates.index.tolist(),
-        "similarities": estimates.templates.similarity.nan_to_num(neginf=-1.0).tolist(),
-        "best": estimates.best.tolist(),
+        "valid": valid.squeeze(1).bool().tolist(),
+        "status": [PoseStatus(int(code)).name for code in status.squeeze(1)],
+        "score": score.squeeze(1).tolist(),
+        "num_inliers": num_inliers.squeeze(1).long().tolist(),
+        "num_patches": num_patches.squeeze(1).long().tolist(),
+        "R": R.unflatten(1, (3, 3)).tolist(),
+        "t": t.tolist(),
+        "templates": index.long().tolist(),
+        "similarities": similarity.tolist(),
+        "best": best.squeeze(1).long().tolist(),
     }
     return [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
 

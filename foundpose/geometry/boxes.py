@@ -5,6 +5,8 @@
 import torch
 from torch import Tensor
 
+from foundpose.devices import constant
+
 
 def boxes_from_masks(masks: Tensor) -> tuple[Tensor, Tensor]:
     """Tight boxes around masks.
@@ -25,7 +27,7 @@ def boxes_from_masks(masks: Tensor) -> tuple[Tensor, Tensor]:
     low_v, high_v = _first_and_last(rows)
     boxes = torch.stack([low_u - 0.5, low_v - 0.5, high_u + 0.5, high_v + 0.5], dim=-1)
     height, width = masks.shape[1:]
-    whole = boxes.new_tensor([-0.5, -0.5, width - 0.5, height - 0.5])
+    whole = constant([-0.5, -0.5, width - 0.5, height - 0.5], boxes)
     return torch.where(valid[:, None], boxes, whole), valid
 
 

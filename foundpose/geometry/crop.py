@@ -1,15 +1,14 @@
 """Perspective crops: virtual pinhole cameras focused on image regions."""
 
-import math
 from typing import Literal, NamedTuple, get_args
 
 import torch
-import torch.nn.functional as F
-from kornia.geometry.transform import warp_perspective
 from torch import Tensor, nn
 
+from foundpose.devices import constant, indices_on
 from foundpose.geometry.boxes import boxes_from_masks, masks_from_boxes
 from foundpose.geometry.cameras import camera_on_boxes
+from foundpose.geometry.warp import sample_pixels, sample_pyramids, warped_pixels
 
 Background = Literal["keep", "black"]
 
@@ -89,7 +88,7 @@ class PerspectiveCrop(nn.Module):
             masks: (B, H, W), non-zero inside. Either masks or boxes must be given; with both, the boxes say where
                 the crops look and the masks are warped along.
             boxes: (B, 4) as ``(left, top, right, bottom)`` pixel edges.
-            image_index: (B,) which image each mask belongs to; may be left out where B == N.
+            image_index: (B,) which image each mask belongs to; may be left out where B == N. Best on the host.
 
         Returns:
             The crops; pictures in the dtype of ``images``, cameras in at least single precision.
@@ -98,19 +97,20 @@ class PerspectiveCrop(nn.Module):
             ValueError: shapes or values that do not fit.
 
         Differentiable w.r.t. ``images``, ``K`` and ``boxes``. The crops' masks, and boxes that are found from
-        masks, are constants; to differentiate a soft mask, pass it through :func:`warp_images`.
+        masks, are constants; to differentiate a soft mask, pass it through ``foundpose.geometry.warp.warp_images``.
         """
-        image_index = _check_inputs(images, K, masks, boxes, image_index)
+        image_of_crop = _check_inputs(images, K, masks, boxes, image_index)
         # Half precision and autocast move pixels: cameras and warps are computed in single precision at least.
         dtype = torch.promote_types(images.dtype, torch.float32)
         boxes = None if boxes is None else boxes.to(images.device, dtype)
         with torch.autocast(images.device.type, enabled=False):
-            crops = self._crop(images.to(dtype), K.to(images.device, dtype), masks, boxes, image_index)
+            crops = self._crop(images.to(dtype), K.to(images.device, dtype), masks, boxes, image_of_crop)
         return crops._replace(images=crops.images.to(images.dtype))
 
     def _crop(
-        self, images: Tensor, K: Tensor, masks: Tensor | None, boxes: Tensor | None, image_index: Tensor
+        self, images: Tensor, K: Tensor, masks: Tensor | None, boxes: Tensor | None, image_of_crop: list[int]
     ) -> Crops:
+        image_index = indices_on(images.device, torch.tensor(image_of_crop, dtype=torch.int64))
         height, width = images.shape[-2:]
         K, is_camera = _usable_intrinsics(K, height, width)
         if masks is not None:
@@ -128,70 +128,28 @@ class PerspectiveCrop(nn.Module):
         homographies = K_crop @ T_crop_from_camera[:, :3, :3] @ torch.linalg.inv(K_camera)
         levels = torch.zeros(len(boxes), device=images.device, dtype=images.dtype)
         if self.antialias:
-            shrink = K_camera[:, [0, 1], [0, 1]].amax(1) / K_crop[:, 0, 0]
+            shrink = torch.maximum(K_camera[:, 0, 0], K_camera[:, 1, 1]) / K_crop[:, 0, 0]
             levels = shrink.clamp(min=1.0).log2()
-        crops = warp_images(images, homographies, image_index, levels, self.size)
-        crops = torch.where(valid[:, None, None, None], crops, crops.detach())
+        positions = warped_pixels(homographies, self.size)
+        crops = sample_pyramids(images, positions, image_of_crop, levels)
+        if crops.requires_grad:
+            crops = torch.where(valid[:, None, None, None], crops, crops.detach())
         region = masks_from_boxes(boxes.detach(), height, width) if masks is None else masks != 0
         region = (region & valid[:, None, None]).to(images.dtype)
-        crop_masks = warp_perspective(
-            region[:, None], homographies.detach(), (self.size, self.size), align_corners=True
-        )
+        crop_masks = sample_pixels(region[:, None], positions.detach())
         if self.background == "black":
             crops = torch.where(crop_masks > 0.5, crops, torch.zeros_like(crops))
         return Crops(crops, crop_masks[:, 0], K_crop, T_crop_from_camera, boxes, valid)
 
 
-def warp_images(
-    images: Tensor, homographies: Tensor, image_index: Tensor, levels: Tensor, size: int
-) -> Tensor:
-    """Warp images to square crops, sampling level ``levels`` of their pyramids.
-
-    Args:
-        images: (N, C, H, W).
-        homographies: (B, 3, 3) from pixels of the image to pixels of the crop.
-        image_index: (B,) which image to warp.
-        levels: (B,) pyramid level, 0 is the image itself; in between, two levels are blended.
-        size: side of the crops.
-
-    Returns:
-        (B, C, size, size). Differentiable w.r.t. ``images``, ``homographies`` and ``levels``.
-    """
-    height, width = images.shape[-2:]
-    top_level = int(math.log2(min(height, width))) - 1
-    levels = levels.clamp(max=max(top_level, 0))
-    # The one transfer to the host: which crop needs which image and level.
-    plan = torch.stack([image_index.to(levels.dtype), levels.floor(), levels.ceil()]).tolist()
-    members: dict[tuple[int, int], list[int]] = {}
-    for crop, (image, low, high) in enumerate(zip(*plan, strict=True)):
-        for level in {int(low), int(high)}:
-            members.setdefault((int(image), level), []).append(crop)
-    pyramid = [images]
-    for _ in range(max((level for _, level in members), default=0)):
-        pyramid.append(F.avg_pool2d(pyramid[-1], 2, ceil_mode=True, count_include_pad=False))
-    out = images.new_zeros(len(homographies), images.shape[1], size, size)
-    for (image, level), crop_list in members.items():
-        crops = torch.tensor(crop_list, device=images.device)
-        factor = 2.0**level
-        # Pixel u of a level is centred at factor * (u + 0.5) - 0.5 in the image.
-        to_image = homographies.new_tensor(
-            [[factor, 0.0, factor / 2 - 0.5], [0.0, factor, factor / 2 - 0.5], [0.0, 0.0, 1.0]]
-        )
-        source = pyramid[level][image].expand(len(crop_list), -1, -1, -1)
-        warped = warp_perspective(source, homographies[crops] @ to_image, (size, size), align_corners=True)
-        weight = 1.0 - (levels[crops] - level).abs()
-        out = out.index_add(0, crops, warped * weight[:, None, None, None])
-    return out
-
-
 def _usable_intrinsics(K: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
     """Replace intrinsics (N, 3, 3) that are no pinhole camera's by a common camera's; say which ones were usable."""
-    focal = K[:, [0, 1], [0, 1]]
-    bottom = K.new_tensor([0.0, 0.0, 1.0])
+    focal = K.diagonal(dim1=1, dim2=2)[:, :2]
+    bottom = constant([0.0, 0.0, 1.0], K)
     usable = torch.isfinite(K).all(dim=(1, 2)) & (focal > 0).all(dim=1) & (K[:, 2] == bottom).all(dim=1)
     focal_length = float(max(height, width))
-    common = K.new_tensor(
-        [[focal_length, 0.0, (width - 1) / 2], [0.0, focal_length, (height - 1) / 2], [0.0, 0.0, 1.0]]
+    common = constant(
+        [[focal_length, 0.0, (width - 1) / 2], [0.0, focal_length, (height - 1) / 2], [0.0, 0.0, 1.0]], K
     )
     return torch.where(usable[:, None, None], K, common), usable
 
@@ -204,14 +162,14 @@ def _usable_boxes(
     valid = usable & torch.isfinite(boxes).all(dim=-1) & (right > left) & (bottom > top)
     valid &= torch.maximum(right - left, bottom - top) >= min_size
     valid &= (right > -0.5) & (left < width - 0.5) & (bottom > -0.5) & (top < height - 0.5)
-    whole = boxes.new_tensor([-0.5, -0.5, width - 0.5, height - 0.5])
+    whole = constant([-0.5, -0.5, width - 0.5, height - 0.5], boxes)
     return torch.where(valid[:, None], boxes, whole), valid
 
 
 def _check_inputs(
     images: Tensor, K: Tensor, masks: Tensor | None, boxes: Tensor | None, image_index: Tensor | None
-) -> Tensor:
-    """Check shapes and values; return the image index."""
+) -> list[int]:
+    """Check shapes and values; return the image of each crop."""
     if images.dim() != 4 or images.shape[1] != 3 or not images.is_floating_point():
         raise ValueError(
             f"images must be floating point (N, 3, H, W), got {images.dtype} {tuple(images.shape)}"
@@ -233,11 +191,13 @@ def _check_inputs(
     if image_index is None:
         if count != num_images:
             raise ValueError(f"image_index is needed: {count} masks or boxes for {num_images} images")
-        return torch.arange(count, device=images.device)
+        return list(range(count))
     if image_index.shape != (count,) or image_index.is_floating_point() or image_index.dtype == torch.bool:
         raise ValueError(
             f"image_index must be ({count},) integers, got {tuple(image_index.shape)} {image_index.dtype}"
         )
-    if count and not 0 <= int(image_index.min()) <= int(image_index.max()) < num_images:
-        raise ValueError(f"image_index must lie in [0, {num_images}), got {image_index.tolist()}")
-    return image_index.to(images.device)
+    # Waits for the device if the index lies there; on the host, where callers have it from, it costs nothing.
+    image_of_crop: list[int] = image_index.tolist()
+    if count and not 0 <= min(image_of_crop) <= max(image_of_crop) < num_images:
+        raise ValueError(f"image_index must lie in [0, {num_images}), got {image_of_crop}")
+    return image_of_crop

@@ -99,15 +99,11 @@ def match_patches(
     points = template_points.flatten(0, 1)
     crop = torch.arange(B * h, device=query.device) // h
     blocks = []
-    for block in torch.arange(B * h, device=query.device).split(max(1, _DISTANCES_PER_BLOCK // (P * Q))):
+    rows = max(1, _DISTANCES_PER_BLOCK // (P * Q))
+    for block in (slice(first, first + rows) for first in range(0, B * h, rows)):
         mine = crop[block]
-        q, q_valid, t, t_valid, x = (
-            query[mine],
-            query_valid[mine],
-            template[block],
-            template_valid[block],
-            points[block],
-        )
+        q, q_valid = query.index_select(0, mine), query_valid[mine]
+        t, t_valid, x = template[block], template_valid[block], points[block]
         forth, back = nearest_patches(q, q_valid, t, t_valid, query_pixels is not None)
         ok = q_valid & t_valid.any(dim=1, keepdim=True)
         nearest = t.gather(1, forth.unsqueeze(-1).expand_as(q))

@@ -23,6 +23,9 @@ class BarronLoss(nn.Module):
         learnable: make α and c (by its logarithm) parameters. Minimising this loss alone over them is pointless
             (smaller α is always cheaper); it is meant for an outer loss on what the optimisation returns.
 
+    Attributes:
+        fixed_alpha: α as a number on the host, or None if it is learned.
+
     Raises:
         ValueError: ``scale`` is not positive, or ``alpha`` is NaN.
 
@@ -44,7 +47,7 @@ class BarronLoss(nn.Module):
             raise ValueError("alpha must be a number, got NaN")
         shape, log_scale = torch.tensor(float(alpha)), torch.tensor(float(scale)).log()
         self.learnable = learnable
-        self._power = _algebraic_power(shape, learnable)
+        self.fixed_alpha = None if learnable else float(alpha)
         if learnable:
             self.alpha, self.log_scale = nn.Parameter(shape), nn.Parameter(log_scale)
         else:
@@ -98,12 +101,12 @@ class BarronLoss(nn.Module):
 
     def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
         super()._load_from_state_dict(*args, **kwargs)
-        self._power = _algebraic_power(self.alpha, self.learnable)
+        self.fixed_alpha = None if self.learnable else float(self.alpha)
 
     def _half(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """Barron's value and the weight relative to that at zero, of z = (x / c)²."""
-        if self._power is not None:
-            return _negative_integer(z, self._power)
+        if self.fixed_alpha is not None and -self.fixed_alpha in range(1, _LARGEST_POWER + 1):
+            return _negative_integer(z, int(-self.fixed_alpha))
         eps = torch.finfo(z.dtype).eps
         # Beyond ±1 / √eps the loss equals its limit to rounding, and b > 0 keeps z / b finite: at α = 2 the value
         # does not depend on b.
@@ -112,12 +115,6 @@ class BarronLoss(nn.Module):
         u = torch.log1p(z / b)
         # b / α ((z / b + 1)^(α / 2) − 1) = b u / 2 · (eʸ − 1) / y with y = α u / 2, smooth through α = 0.
         return 0.5 * b * u * _expm1_ratio(0.5 * alpha * u), torch.exp((0.5 * alpha - 1.0) * u)
-
-
-def _algebraic_power(alpha: Tensor, learnable: bool) -> int | None:
-    """−α where that is a small whole number and stays so."""
-    power = None if learnable else -float(alpha)
-    return int(power) if power is not None and power in range(1, _LARGEST_POWER + 1) else None
 
 
 def _negative_integer(z: Tensor, power: int) -> tuple[Tensor, Tensor]:

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from foundpose.devices import constant
 from foundpose.geometry.transforms import make_transform, transform_points
 from foundpose.optimization.derivatives import attach_optimum, eigenbasis, safe_sqrt
 from foundpose.pnp.polish import check_correspondences, rays_of_usable_pixels, usable_coordinates
@@ -88,7 +89,7 @@ def solve_epnp(
     if points_image.shape[1] == 4:
         usable = usable.all(-1, keepdim=True).expand_as(usable)
     bad = ~usable.unsqueeze(-1)
-    rays = torch.where(bad, rays.new_tensor([0.0, 0.0, 1.0]), rays)
+    rays = torch.where(bad, constant([0.0, 0.0, 1.0], rays), rays)
     points_model = points_model.masked_fill(bad, 0.0)
     if points_image.shape[1] == 4:
         return solve_epnp_minimal(rays, points_model)  # which flags four equal points
@@ -285,7 +286,7 @@ def _stand_in(degenerate: Tensor, rays: Tensor, points: Tensor) -> tuple[Tensor,
     """Rays, bearings and points of solvable problems, the same one for all degenerate samples."""
     cloud = torch.arange(3.0 * points.shape[1], dtype=points.dtype, device=points.device).square().sin()
     cloud = cloud.unflatten(0, (-1, 3))
-    ahead = cloud + cloud.new_tensor([0.0, 0.0, 4.0])
+    ahead = cloud + constant([0.0, 0.0, 4.0], cloud)
     rays = torch.where(degenerate[:, None, None], ahead / ahead[:, 2:], rays)
     bearings = rays / torch.linalg.vector_norm(rays, dim=-1, keepdim=True)
     return rays, bearings, torch.where(degenerate[:, None, None], cloud, points)

@@ -316,9 +316,8 @@ class RansacPnp(nn.Module):
         steps: int | None = None,
     ) -> tuple["_Polished", Tensor]:
         """Polish poses on their inliers, and select these anew, where that does not raise the truncated cost (P,)."""
-        T = self.polish.optimise(before.T, *problem[:3], problem.weigh(before.inliers), tolerance=tolerance)[
-            0
-        ].T
+        weights = problem.weigh(before.inliers)
+        T = self.polish.optimise(before.T, *problem[:3], weights, tolerance, steps)[0].T
         inliers, _, cost = self._select(T, problem)
         # Equal but for rounding counts as equal, or rounding would decide whether the last polish is kept.
         most = before.cost * (1.0 + 64.0 * torch.finfo(cost.dtype).eps)

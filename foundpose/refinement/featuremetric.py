@@ -227,14 +227,20 @@ class FeaturemetricAlignment(nn.Module):
 
     def _ceiling(self, descriptors: Tensor) -> Tensor:
         """Cost (n, P) of a patch that is not seen."""
-        if isinstance(self.loss, BarronLoss) and bool(self.loss.alpha < 0):
+        known = self.loss.fixed_alpha if isinstance(self.loss, BarronLoss) else 0.0
+        bound: Tensor | None = None
+        if isinstance(self.loss, BarronLoss) and (known is None or known < 0):
             channels = descriptors.shape[-1] if self.residual == "channel" else 1
-            return (channels * self.loss.ceiling.to(descriptors.dtype)).expand(descriptors.shape[:2])
+            bound = (channels * self.loss.ceiling.to(descriptors.dtype)).expand(descriptors.shape[:2])
+            if known is not None:
+                return bound
         # A loss without a ceiling: as if the crop showed the opposite of what the patch looks like.
         squared = (2.0 * descriptors).square()
         if self.residual == "norm":
             squared = squared.sum(-1, keepdim=True)
-        return self.loss(squared)[0].sum(-1)
+        opposite = self.loss(squared)[0].sum(-1)
+        # α is learned: which of the two it is, the device knows.
+        return opposite if bound is None else torch.where(torch.isfinite(bound), bound, opposite)
 
     def _equations(
         self, T_local: Tensor, goal: "_Goal", unit: Tensor | None, ceiling: Tensor

@@ -6,6 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from foundpose.devices import indices_on
 from foundpose.refinement.base import PoseProposals, PoseRefiner, RefinedPoses
 from foundpose.refinement.featuremetric import AlignmentProblem, FeaturemetricAlignment
 
@@ -60,7 +61,7 @@ def alignment_problem(proposals: PoseProposals) -> AlignmentProblem:
         rows = torch.nonzero(proposals.object_index == i).flatten()
         if len(rows) == 0:
             continue
-        rows_here = rows.to(device)
+        rows_here = indices_on(device, rows)
         projection = representation.projection
         maps.append(projection(raw[rows_here].to(projection.components.dtype)).to(dtype))
         patches = representation.gather_templates(proposals.template_index[rows_here].flatten())
@@ -76,7 +77,7 @@ def alignment_problem(proposals: PoseProposals) -> AlignmentProblem:
         for descriptors, points, valid in parts
     ]
     # Back to the order of the batch.
-    back = torch.cat(order).argsort().to(device)
+    back = indices_on(device, torch.cat(order).argsort())
     poses = (back[:, None] * n + torch.arange(n, device=device)).flatten()
     descriptors, points, valid = (torch.cat(field)[poses] for field in zip(*padded, strict=True))
     return AlignmentProblem(

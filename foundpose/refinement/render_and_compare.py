@@ -6,8 +6,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from foundpose.devices import constant
 from foundpose.geometry import camera_on_boxes, invert_transform, project_points, transform_points
-from foundpose.geometry.crop import warp_images
+from foundpose.geometry.warp import warp_images
 from foundpose.refinement.base import PoseProposals, PoseRefiner, RefinedPoses
 from foundpose.refinement.pose_update import UPDATE_SIZE, apply_update
 from foundpose.rendering import Mesh, Renderer
@@ -276,7 +277,7 @@ class RenderAndCompareRefiner(PoseRefiner):
         left, top, right, bottom = boxes.unbind(-1)
         valid = valid & torch.isfinite(boxes).all(-1) & (right > left) & (bottom > top)
         valid &= (right > -0.5) & (left < width - 0.5) & (bottom > -0.5) & (top < height - 0.5)
-        whole = boxes.new_tensor([-0.5, -0.5, width - 0.5, height - 0.5])
+        whole = constant([-0.5, -0.5, width - 0.5, height - 0.5], boxes)
         return (
             valid,
             torch.where(valid[:, None], boxes, whole),

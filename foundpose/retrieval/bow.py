@@ -12,6 +12,7 @@ IdfMode = Literal["document", "occurrence"]
 
 # Distances to all words exist for one block of patches at a time: 8 M entries, 32 MiB in float32.
 _DISTANCES_PER_BLOCK = 1 << 23
+_GROUP = 64
 
 
 class WordAssignment(NamedTuple):
@@ -48,11 +49,31 @@ def nearest_words(descriptors: Tensor, words: Tensor, num_nearest: int) -> tuple
     for start in range(0, descriptors.shape[0], rows):
         block = slice(start, start + rows)
         score = torch.addmm(squared_norms, fixed[block], fixed_words.T, alpha=-2.0)
-        index[block] = score.topk(num_nearest, dim=1, largest=False).indices
+        index[block] = _smallest(score, num_nearest)
     rows = max(1, _DISTANCES_PER_BLOCK // (num_nearest * words.shape[1]))
     pairs = zip(descriptors.split(rows), index.split(rows), strict=True)
-    distance = torch.cat([(x.unsqueeze(1) - words[i]).square().sum(dim=-1) for x, i in pairs])
-    return distance, index
+    # Whole rows are selected: several times as fast on a CPU as indexing by a tensor.
+    nearest = ((x, words.index_select(0, i.flatten()).unflatten(0, i.shape)) for x, i in pairs)
+    distance = torch.cat([(x.unsqueeze(1) - near).square().sum(dim=-1) for x, near in nearest])
+    # The products above are too coarse to tell words apart that are nearly as far.
+    distance, order = distance.sort(dim=1, stable=True)
+    return distance, index.gather(1, order)
+
+
+def _smallest(scores: Tensor, count: int) -> Tensor:
+    """Indices (n, count) of the smallest of scores (n, k), in no particular order.
+
+    They lie in the groups with the smallest minima: a search in two steps, of which the first is vectorised, takes a
+    third of the time of ``topk``.
+    """
+    groups = scores.shape[1] // _GROUP
+    if scores.shape[1] % _GROUP or groups < 2 * count:
+        return scores.topk(count, dim=1, largest=False).indices
+    grouped = scores.unflatten(1, (groups, _GROUP))
+    near = grouped.amin(dim=2).topk(count, dim=1, largest=False).indices
+    few = grouped.gather(1, near.unsqueeze(2).expand(-1, -1, _GROUP)).flatten(1)
+    place = few.topk(count, dim=1, largest=False).indices
+    return near.gather(1, place // _GROUP) * _GROUP + place % _GROUP
 
 
 def assign_words(

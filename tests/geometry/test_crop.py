@@ -2,6 +2,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from kornia.geometry.transform import warp_perspective
 
 from foundpose.geometry import (
     PerspectiveCrop,
@@ -15,7 +16,7 @@ from foundpose.geometry import (
     shift_intrinsics,
     transform_points,
 )
-from foundpose.geometry.crop import warp_images
+from foundpose.geometry.warp import warp_images
 
 
 def camera(dtype=torch.float64):
@@ -67,6 +68,19 @@ def test_identity_warp_of_a_ramp_and_integer_shift():
     shift[0, :2, 2] = torch.tensor([-5.0, -3.0], dtype=torch.float64)
     moved = warp_images(image, shift, zero, torch.zeros(1, dtype=torch.float64), 32)
     assert torch.allclose(moved, image[..., 3:35, 5:37], atol=1e-9)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_warp_equals_kornias(dtype):
+    generator = torch.Generator().manual_seed(4)
+    images = torch.rand(3, 3, 90, 121, generator=generator).to(dtype)
+    eye = torch.eye(3).repeat(3, 1, 1)
+    H = (eye + torch.randn(3, 3, 3, generator=generator) * torch.tensor([[0.2], [0.2], [5e-4]])).to(dtype)
+    H[:, :2, 2] += torch.tensor([-20.0, -12.0], dtype=dtype)
+    ours = warp_images(images, H, torch.arange(3), torch.zeros(3, dtype=dtype), 70)
+    theirs = warp_perspective(images, H, (70, 70), align_corners=True)
+    assert (ours - theirs).abs().max() < (2e-4 if dtype == torch.float32 else 1e-10)
+    assert (ours > 0).double().mean() > 0.5
 
 
 def test_intrinsics_of_shift_and_resize():

@@ -23,7 +23,8 @@ from foundpose.geometry import (
     transform_points,
     unproject_pixels,
 )
-from foundpose.geometry.crop import Crops, warp_images
+from foundpose.geometry.crop import Crops
+from foundpose.geometry.warp import warp_images
 
 
 def randn(*shape: int, seed: int = 0) -> Tensor:
