@@ -95,3 +95,27 @@ def test_parameters_and_state() -> None:
             BarronLoss(scale=bad)
     with pytest.raises(ValueError, match="alpha must be a number"):
         BarronLoss(alpha=math.nan)
+
+
+@pytest.mark.parametrize("alpha", [-1.0, -2.0, -5.0, -8.0])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_whole_negative_shapes_equal_the_general_formula(alpha: float, dtype: torch.dtype) -> None:
+    squared = torch.cat([torch.zeros(1), torch.logspace(-12, 8, 200)]).to(dtype)
+    squared.requires_grad_()
+    fast, general = BarronLoss(alpha, 0.7), BarronLoss(alpha, 0.7, learnable=True)
+    assert fast.fixed_alpha == alpha
+    assert general.fixed_alpha is None
+    tolerance = 1e-5 if dtype == torch.float32 else 1e-13
+    for ours, theirs in zip(fast(squared), general(squared), strict=True):
+        # Relative, also of the smallest residuals.
+        torch.testing.assert_close(ours, theirs, rtol=tolerance, atol=0.0)
+        slopes = [torch.autograd.grad(x.sum(), squared, retain_graph=True)[0] for x in (ours, theirs)]
+        torch.testing.assert_close(*slopes, rtol=10 * tolerance, atol=10 * torch.finfo(dtype).eps)
+
+
+def test_a_loaded_shape_is_the_one_used() -> None:
+    loss = BarronLoss(-5.0, 0.5)
+    loss.load_state_dict(BarronLoss(-1.5, 0.5).state_dict())
+    assert loss.fixed_alpha == -1.5
+    x = torch.linspace(0.0, 3.0, 7)
+    torch.testing.assert_close(loss(x)[0], BarronLoss(-1.5, 0.5)(x)[0])

@@ -73,6 +73,13 @@ def test_nearest_words_equal_sklearn() -> None:
     torch.testing.assert_close(distance.sqrt(), torch.from_numpy(reference_distance))
 
 
+@pytest.mark.parametrize("words", [63, 64, 256, 2048])
+def test_the_search_in_groups_equals_topk(words: int) -> None:
+    scores = torch.randn(50, words, generator=torch.Generator().manual_seed(words))
+    found = bow_module._smallest(scores, 3).sort(dim=1).values
+    assert torch.equal(found, scores.topk(3, dim=1, largest=False).indices.sort(dim=1).values)
+
+
 def test_idf_equals_sklearn_and_is_not_negative() -> None:
     x, valid, words = crops(12, 30, 60, 5)
     assignment = assign_words(x, valid, words, sigma=1.0, num_nearest=2)
