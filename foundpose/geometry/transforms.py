@@ -7,6 +7,7 @@
 import math
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 # Below this squared angle the coefficients of the exponential map are summed as power series.
@@ -61,27 +62,27 @@ def se3_exp(twist: Tensor) -> Tensor:
         raise ValueError(f"twist must have shape (..., 6), got {tuple(twist.shape)}")
     # Written out, where kornia's So3 takes six times as many operations: optimisers call this in every step.
     v, w = twist.split(3, dim=-1)
-    A, B, C = _exponential_coefficients(w.square().sum(-1, keepdim=True))
     x, y, z = w.unbind(-1)
     zero = torch.zeros_like(x)
     hat = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
-    # R = I + A [w]× + B [w]×², and [w]×² = w wᵀ − |w|² I.
-    outer = (B * w).unsqueeze(-1) * w.unsqueeze(-2)
-    diagonal = 1.0 - outer.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True)
-    R = A.unsqueeze(-1) * hat + outer + torch.diag_embed(diagonal.expand_as(w))
-    t = A * v + B * torch.linalg.cross(w, v, dim=-1) + C * (w * v).sum(-1, keepdim=True) * w
-    return make_transform(R, t)
+    # The series of exp(X) ends: X⁴ = −θ² X² for a twist's matrix X, so I + X + B X² + C X³ is all of it.
+    X = torch.cat([hat, v.unsqueeze(-1)], dim=-1)
+    B, C = _exponential_coefficients(w.square().sum(-1, keepdim=True).unsqueeze(-1))
+    square = hat @ X
+    top = X + B * square + C * (hat @ square)
+    identity = torch.eye(4, dtype=twist.dtype, device=twist.device)
+    return identity + F.pad(top, (0, 0, 0, 1))
 
 
-def _exponential_coefficients(squared: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """sin θ / θ, (1 − cos θ) / θ² and (θ − sin θ) / θ³ of squared angles θ², smooth through zero."""
+def _exponential_coefficients(squared: Tensor) -> tuple[Tensor, Tensor]:
+    """(1 − cos θ) / θ² and (θ − sin θ) / θ³ of squared angles θ², smooth through zero."""
     small = squared < _SMALL_SQUARED_ANGLE
     near = torch.where(small, squared, 0.0)
     far = torch.where(small, 1.0, squared)
     angle = far.sqrt()
     B = torch.where(small, _alternating_series(near, 2), (1.0 - angle.cos()) / far)
     C = torch.where(small, _alternating_series(near, 3), (angle - angle.sin()) / (far * angle))
-    return 1.0 - squared * C, B, C
+    return B, C
 
 
 def _alternating_series(s: Tensor, first: int) -> Tensor:

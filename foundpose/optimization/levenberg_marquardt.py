@@ -28,7 +28,7 @@ class LevenbergMarquardtResult(NamedTuple):
 
     Attributes:
         T: (B, 4, 4) optimised poses.
-        cost: (B,) cost at ``T``; never above ``initial_cost``.
+        cost: (B,) cost at ``T``; never above ``initial_cost`` but for rounding.
         initial_cost: (B,) cost at the initial poses.
         iterations: (B,) int64, steps tried for each sample.
         converged: (B,) bool, the predicted decrease fell below the tolerance.
@@ -108,6 +108,12 @@ def levenberg_marquardt(
     iterations = torch.zeros(T.shape[0], dtype=torch.int64, device=T.device)
     converged = torch.zeros(T.shape[0], dtype=torch.bool, device=T.device)
     failed = ~(_finite(cost, H, g) & (H.diagonal(dim1=-2, dim2=-1).amax(-1) > 0))
+    # Unit systems stand in for those that cannot be solved, so that no NaN enters the graph; what is accepted below
+    # is finite.
+    initial_H = H
+    identity = torch.eye(6, dtype=H.dtype, device=H.device)
+    H = torch.where(failed[:, None, None], identity, H)
+    g = torch.where(failed[:, None], 0.0, g)
 
     for iteration in range(max_iterations):
         active = ~(converged | failed)
@@ -119,7 +125,10 @@ def levenberg_marquardt(
 
         T_new = se3_exp(step) @ T
         cost_new, H_new, g_new = evaluate(T_new)
-        accepted = active & solved & (cost_new <= cost) & _finite(cost_new, H_new, g_new)
+        # A decrease below rounding may look like a rise, but the step still brings g closer to zero.
+        rounding = eps * cost.detach()
+        most = torch.where(predicted <= rounding, cost + rounding, cost)
+        accepted = active & solved & (cost_new <= most) & _finite(cost_new, H_new, g_new)
         T = torch.where(accepted[:, None, None], T_new, T)
         cost = torch.where(accepted, cost_new, cost)
         H = torch.where(accepted[:, None, None], H_new, H)
@@ -128,6 +137,7 @@ def levenberg_marquardt(
         damping = torch.where(accepted, damping * 0.1, damping * 10.0).clamp(1e-10, 1e10)
         iterations = iterations + active.to(iterations.dtype)
         converged = converged | (active & finished)
+    H = torch.where(failed[:, None, None], initial_H, H)
     regular = torch.ones_like(failed)
     return LevenbergMarquardtResult(T, cost, initial_cost, iterations, converged, failed, H, regular)
 
@@ -138,20 +148,15 @@ def _finite(cost: Tensor, H: Tensor, g: Tensor) -> Tensor:
 
 
 def _solve(H: Tensor, g: Tensor, damping: Tensor) -> tuple[Tensor, Tensor]:
-    """Damped step (B, 6) and whether it could be solved for (B,); the step is zero where it could not."""
+    """Damped step (B, 6) of finite systems and whether it could be solved for (B,); it is zero where it could not."""
     diagonal = H.diagonal(dim1=-2, dim2=-1)
-    usable = _finite(damping, H, g) & (diagonal.amax(-1) > 0)
-    # Unit matrices stand in for unusable systems, so that no NaN enters the graph.
-    H = torch.where(usable[:, None, None], H, torch.eye(6, dtype=H.dtype, device=H.device))
-    g = torch.where(usable[:, None], g, 0.0)
-    diagonal = H.diagonal(dim1=-2, dim2=-1)
-    smallest = torch.finfo(H.dtype).eps * diagonal.amax(-1, keepdim=True)
-    scaling = torch.maximum(diagonal, smallest)
+    limits = torch.finfo(H.dtype)
     # Solving in the scaled variables keeps the condition number free of the units.
-    root = scaling.sqrt()
-    scaled = H / (root[:, :, None] * root[:, None, :]) + torch.diag_embed(damping[:, None].expand_as(root))
+    root = torch.maximum(diagonal, limits.eps * diagonal.amax(-1, keepdim=True)).clamp(min=limits.tiny).sqrt()
+    scaled = H / (root.unsqueeze(-1) * root.unsqueeze(-2))
+    scaled.diagonal(dim1=-2, dim2=-1).add_(damping.unsqueeze(-1))
     factor, info = torch.linalg.cholesky_ex(scaled.detach())
-    solved = usable & (info == 0)
+    solved = info == 0
     if torch.is_grad_enabled():
         # Its derivative would be NaN where it fails.
         identity = torch.eye(6, dtype=H.dtype, device=H.device)

@@ -109,7 +109,7 @@ class FeaturemetricAlignment(nn.Module):
         auto_scale: bool = False,
         interpolation: Interpolation = "bilinear",
         max_iterations: int = 30,
-        tolerance: float = 1e-5,
+        tolerance: float = 1e-4,
         differentiation: Differentiation = "implicit",
     ) -> None:
         super().__init__()

@@ -1,4 +1,5 @@
 import importlib
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from foundpose.retrieval.kmeans import (
     relocate,
     split_gains,
 )
+from foundpose.retrieval.neighbourhoods import Neighbourhoods
 from foundpose.retrieval.words import VisualWords
 
 # The package exports a function of the module's name.
@@ -95,13 +97,66 @@ def test_find_nearest_equals_brute_force(monkeypatch: pytest.MonkeyPatch) -> Non
         torch.testing.assert_close(second, expected.values[:, 1])
 
 
-def test_rough_products_do_not_change_the_outcome(monkeypatch: pytest.MonkeyPatch) -> None:
-    x = mixture(8000, 64, 200, 0.6)
-    inertia = []
-    for fast in (False, True):
-        monkeypatch.setattr(kmeans_module, "has_fast_bfloat16", lambda device, fast=fast: fast)
-        inertia.append(kmeans(x, 128).inertia.item())
-    assert abs(inertia[0] / inertia[1] - 1) < 0.01
+def coordinate_codes(count: int, channels: int, seed: int = 0) -> Tensor:
+    """Descriptors that vary smoothly over a surface: lengths of 40 beside clusters of a few units."""
+    g = torch.Generator().manual_seed(seed)
+    points = torch.nn.functional.normalize(torch.randn(count, 3, generator=g), dim=1)
+    directions = torch.nn.functional.normalize(torch.randn(3, channels, generator=g), dim=0)
+    phases = 6.3 * torch.rand(channels, generator=g)
+    return 40.0 * (2.0 / channels) ** 0.5 * torch.cos(2.0 * points @ directions + phases)
+
+
+def test_clusters_that_are_small_beside_the_descriptors() -> None:
+    x = coordinate_codes(20_000, 64)
+    reference = KMeans(256, n_init=1, max_iter=25, tol=0, random_state=0).fit(x.numpy())
+    assert reference.inertia_ / len(x) < 0.02 * 40**2
+    assert kmeans(x, 256).inertia.item() <= 1.002 * reference.inertia_
+
+
+@pytest.mark.parametrize("kind", ["mixture", "codes"])
+def test_searching_neighbourhoods_does_not_change_the_outcome(
+    kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    x = mixture(30_000, 32, 1500, 0.6) if kind == "mixture" else coordinate_codes(30_000, 32)
+    searched = []
+    find = kmeans_module.find_nearest
+
+    def counted(points: Tensor, *arguments: Any) -> tuple[Tensor, Tensor, Tensor | None]:
+        searched.append(len(points))
+        return find(points, *arguments)
+
+    monkeypatch.setattr(kmeans_module, "find_nearest", counted)
+    near = kmeans(x, 1024)
+    of_all = searched.count(len(x))
+    assert of_all < 0.5 * near.num_iterations
+    monkeypatch.setattr(kmeans_module.Neighbourhoods, "worthwhile", lambda k: False)
+    everywhere = kmeans(x, 1024, num_iterations=near.num_iterations)
+    assert searched.count(len(x)) - of_all >= everywhere.num_iterations
+    # Other steps lead to another local minimum; those of other seeds lie as far apart.
+    assert near.inertia <= 1.005 * everywhere.inertia
+
+
+def test_neighbourhoods_hold_all_points_and_search_what_is_near() -> None:
+    x, centroids = mixture(4000, 8, 500, 0.6).double(), mixture(1030, 8, 500, 0.6, seed=1).double()
+    norms = x.square().sum(1)
+    assignment, _, _ = find_nearest(x, norms, centroids)
+    near = Neighbourhoods.around(x, norms, assignment, centroids)
+    assert torch.equal(near.points.sort(dim=0).values, x.sort(dim=0).values)
+    assert near.bounds[0] == 0
+    assert near.bounds[-1] == len(x)
+    sizes = near.groups.bincount()
+    assert 16 < sizes.double().mean() < 64
+    moved = centroids + 0.01 * torch.randn(
+        centroids.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
+    index, cost, second = near.find_nearest(moved, with_second=True)
+    expected = exact_costs(near.points, moved).topk(2, dim=1, largest=False)
+    right = index == expected.indices[:, 0]
+    assert right.double().mean() > 0.999
+    torch.testing.assert_close(cost[right], expected.values[right, 0])
+    assert (second >= cost).all()
+    assert torch.isclose(second, expected.values[:, 1]).double().mean() > 0.99
+    torch.testing.assert_close(cost, (near.points - moved[index]).square().sum(1))
 
 
 def test_cluster_means_equal_numpy_and_keep_empty() -> None:
