@@ -109,7 +109,7 @@ class RansacPnp(nn.Module):
         polish: GaussNewtonPnp | None = None,
         soft_selection: SoftInlierSelection | None = None,
         seed: int = 0,
-        score_points: int | None = 256,
+        score_points: int | None = 128,
         chunk: int | None = None,
     ) -> None:
         super().__init__()
@@ -269,7 +269,7 @@ class RansacPnp(nn.Module):
                 mirrored = mirrored_poses(state.T, problem.points_model, problem.weigh(state.inliers))
                 start = _Polished(mirrored, *self._select(mirrored, problem))
                 # A solid object does not look like its mirror image: most problems end here.
-                alike = found & (2 * start.inliers.sum(-1) >= state.inliers.sum(-1))
+                alike = found & (4 * start.inliers.sum(-1) >= 3 * state.inliers.sum(-1))
                 other = self._climb(start, alike, problem, min(rounds, 1), _MIRROR_STEPS)
                 better = alike & (other.cost < state.cost)
                 state = self._climb(_where(better, other, state), better, problem, rounds - 1)

@@ -191,7 +191,7 @@ def _chunk_sizes(chunk: int | None, batch: int, total: int, device: torch.device
     """Numbers of samples solved at once for each problem."""
     if chunk is None:
         # Few samples take as long as some more: operations cost more than numbers, up to what the cache holds.
-        least, most = (1024, 4096) if device.type == "cpu" else (1 << 14, 1 << 16)
+        least, most = (2048, 4096) if device.type == "cpu" else (1 << 14, 1 << 16)
         chunk, largest = max(least // batch, 32), max(most // batch, 32)
     else:
         largest = chunk
