@@ -32,8 +32,14 @@ def sample_features(
         ``features`` and ``position`` (which cells are read is constant).
     """
     _, h, w, d = features.shape
-    column, across, across_slope = _kernel(position[..., 0], w, interpolation)
-    row, down, down_slope = _kernel(position[..., 1], h, interpolation)
+    if h == w:  # both axes at once, in half of the operations
+        cells, weight, slope = _kernel(position, w, interpolation)
+        (column, row), (across, down), (across_slope, down_slope) = (
+            part.unbind(-2) for part in (cells, weight, slope)
+        )
+    else:
+        column, across, across_slope = _kernel(position[..., 0], w, interpolation)
+        row, down, down_slope = _kernel(position[..., 1], h, interpolation)
     cell = (map_index[:, None, None] * h + row).unsqueeze(-1) * w + column.unsqueeze(-2)  # (n, P, k, k)
     # Whole rows: several times as fast as indexing by a tensor.
     read = features.reshape(-1, d).index_select(0, cell.flatten()).unflatten(0, (-1, cell[0, 0].numel()))

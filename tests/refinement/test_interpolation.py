@@ -15,10 +15,11 @@ def positions(n: int = 4, P: int = 20, low: float = -2.0, high: float = 9.0) -> 
     return low + (high - low) * torch.rand(n, P, 2, generator=generator, dtype=torch.float64)
 
 
-def test_bilinear_values_equal_grid_sample() -> None:
-    features, index, position = maps(), torch.tensor([0, 1, 1, 0]), positions()
+@pytest.mark.parametrize("h", [6, 8])
+def test_bilinear_values_equal_grid_sample(h: int) -> None:
+    features, index, position = maps(h=h), torch.tensor([0, 1, 1, 0]), positions()
     got = sample_features(features, index, position)[..., 0, :]
-    size = torch.tensor([8, 6], dtype=torch.float64)
+    size = torch.tensor([8, h], dtype=torch.float64)
     grid = (2 * position + 1) / size - 1
     expected = F.grid_sample(
         features.permute(0, 3, 1, 2)[index],
