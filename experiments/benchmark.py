@@ -1,0 +1,30 @@
+"""Speed and memory of every stage of inference and onboarding, beside an extractor and other implementations.
+
+python experiments/benchmark.py
+python experiments/benchmark.py quick=true
+python experiments/benchmark.py device=cuda batch_sizes=[1,32] extractor=dinov2_vitl14 precision=fp16
+"""
+
+from pathlib import Path
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from foundpose.benchmark.report import write_report
+from foundpose.benchmark.run import run_benchmark
+from foundpose.config import clear_errors
+from foundpose.progress import ProgressBars
+
+
+@hydra.main(version_base="1.3", config_path="../conf", config_name="benchmark")
+def main(cfg: DictConfig) -> None:
+    """Measure, write ``benchmark.json``, ``benchmark.md`` and ``plots/``, and print the tables."""
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    with clear_errors():
+        result = run_benchmark(cfg, folder, ProgressBars())
+        print(f"\n{write_report(result, folder)}\n{folder / 'benchmark.json'}")
+
+
+if __name__ == "__main__":
+    main()
