@@ -75,26 +75,30 @@ def sample_pyramids(images: Tensor, positions: Tensor, image_index: Sequence[int
     top_level = int(math.log2(min(height, width))) - 1
     levels = levels.clamp(max=max(top_level, 0))
     # The one transfer to the host: which levels are needed.
+    host_levels = levels.tolist()
     members: dict[tuple[int, int], list[int]] = {}
-    for crop, (image, level) in enumerate(zip(image_index, levels.tolist(), strict=True)):
+    for crop, (image, level) in enumerate(zip(image_index, host_levels, strict=True)):
         for whole in {math.floor(level), math.ceil(level)}:
             members.setdefault((image, whole), []).append(crop)
     pyramid = [images]
     for _ in range(max((level for _, level in members), default=0)):
         pyramid.append(F.avg_pool2d(pyramid[-1], 2, ceil_mode=True, count_include_pad=False))
-    out = images.new_zeros(len(positions), images.shape[1], *positions.shape[2:])
+    parts = []
     for (image, level), crop_list in members.items():
         crops = indices_on(images.device, torch.tensor(crop_list))
         # Of an odd number of pixels, half as many and a half are left: a level may be larger than the image.
-        factor = 2.0**level
-        grid = _normalized(
-            positions[crops], factor * pyramid[level].shape[-1], factor * pyramid[level].shape[-2]
-        )
+        size = [2.0**level * side for side in pyramid[level].shape[:-3:-1]]
         source = pyramid[level][image].expand(len(crop_list), -1, -1, -1)
-        weight = 1.0 - (levels[crops] - level).abs()
-        sampled = F.grid_sample(source, grid, align_corners=False) * weight[:, None, None, None]
-        if len(members) == 1:
-            return sampled
+        mine = positions if len(crop_list) == len(positions) else positions[crops]
+        sampled = F.grid_sample(source, _normalized(mine, *size), align_corners=False)
+        if any(host_levels[crop] != level for crop in crop_list):
+            sampled = sampled * (1.0 - (levels[crops] - level).abs())[:, None, None, None]
+        parts.append((crop_list, crops, sampled))
+    if [crop for crop_list, _, _ in parts for crop in crop_list] == list(range(len(positions))) and parts:
+        # Each crop is of one level and they come in order: nothing to add up.
+        return parts[0][2] if len(parts) == 1 else torch.cat([sampled for _, _, sampled in parts])
+    out = images.new_zeros(len(positions), images.shape[1], *positions.shape[2:])
+    for _, crops, sampled in parts:
         out = out.index_add(0, crops, sampled)
     return out
 
