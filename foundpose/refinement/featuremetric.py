@@ -20,6 +20,10 @@ from foundpose.refinement.interpolation import Interpolation, sample_features
 
 ResidualKind = Literal["channel", "norm"]
 
+_OF_EACH_POSE = ("map_index", "K", "descriptors", "points_model", "valid")
+# Numbers of the descriptors of the poses that are aligned at once.
+_CPU_NUMBERS_PER_BLOCK = 1 << 20
+
 
 class AlignmentProblem(NamedTuple):
     """What n poses are aligned with.
@@ -45,6 +49,11 @@ class AlignmentProblem(NamedTuple):
     descriptors: Tensor
     points_model: Tensor
     valid: Tensor
+
+    def take(self, rows: slice) -> "AlignmentProblem":
+        """The part of some of the poses."""
+        mine = {name: getattr(self, name)[rows] for name in _OF_EACH_POSE}
+        return self._replace(**mine)
 
 
 class Alignment(NamedTuple):
@@ -148,7 +157,18 @@ class FeaturemetricAlignment(nn.Module):
         "unrolled" also w.r.t. the initial poses; ``T_crop_from_model`` and the costs carry the gradient. Which cells
         are read, and which patches are lost, is constant, and so is an automatic scale.
         """
-        T = T_crop_from_model
+        poses = len(T_crop_from_model)
+        if T_crop_from_model.device.type == "cpu" and poses > 1:
+            # Poses are independent, and so many as a core's cache holds take less time each than all together.
+            most = max(1, _CPU_NUMBERS_PER_BLOCK // max(1, problem.descriptors[0].numel()))
+            if poses > most:
+                blocks = [slice(first, first + most) for first in range(0, poses, most)]
+                parts = [self._align(T_crop_from_model[rows], problem.take(rows)) for rows in blocks]
+                return Alignment(*(torch.cat(field) for field in zip(*parts, strict=True)))
+        return self._align(T_crop_from_model, problem)
+
+    def _align(self, T: Tensor, problem: AlignmentProblem) -> Alignment:
+        """Align all poses at once."""
         sane = torch.isfinite(T.detach()).all(-1).all(-1)
         start = torch.where(sane[:, None, None], T, torch.eye(4, dtype=T.dtype, device=T.device))
         valid = problem.valid & sane.unsqueeze(-1)

@@ -335,3 +335,13 @@ def test_bad_arguments() -> None:
     ]:
         with pytest.raises(ValueError, match=message):
             FeaturemetricAlignment(**arguments)
+
+
+def test_blocks_of_poses_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem, T = make_problem(7, points=20, noise=0.1)
+    start = perturb(T, 3.0, 3.0)
+    together = build()(start, problem)
+    monkeypatch.setattr("foundpose.refinement.featuremetric._CPU_NUMBERS_PER_BLOCK", 3 * 20 * 16)
+    apart = build()(start, problem)
+    for one, other in zip(together, apart, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-12)
