@@ -13,18 +13,19 @@ from torch import nn
 class StageTimer:
     """Adds up the time spent in the ``forward`` of some modules, as a context manager.
 
-    GPUs are synchronised before a clock is read, so measure only when asked to.
-
     Args:
         modules: what to time, by name.
+        synchronize: wait for the GPUs before a clock is read, which costs time, so measure only when asked to. False
+            for modules that compute on the CPU.
 
     Attributes:
         seconds: time by name, of all calls so far.
         calls: number of calls by name.
     """
 
-    def __init__(self, modules: Mapping[str, nn.Module]) -> None:
+    def __init__(self, modules: Mapping[str, nn.Module], synchronize: bool = True) -> None:
         self.modules = dict(modules)
+        self.synchronize = synchronize
         self.seconds: dict[str, float] = defaultdict(float)
         self.calls: dict[str, int] = defaultdict(int)
         self._started: dict[str, list[float]] = defaultdict(list)
@@ -45,19 +46,18 @@ class StageTimer:
 
     def _start(self, name: str) -> Any:
         def hook(module: nn.Module, arguments: tuple[Any, ...]) -> None:
-            self._started[name].append(_now())
+            self._started[name].append(self._now())
 
         return hook
 
     def _stop(self, name: str) -> Any:
         def hook(module: nn.Module, arguments: tuple[Any, ...], output: Any) -> None:
-            self.seconds[name] += _now() - self._started[name].pop()
+            self.seconds[name] += self._now() - self._started[name].pop()
             self.calls[name] += 1
 
         return hook
 
-
-def _now() -> float:
-    if torch.cuda.is_available():
-        torch.cuda.synchronize()
-    return time.perf_counter()
+    def _now(self) -> float:
+        if self.synchronize and torch.cuda.is_available():
+            torch.cuda.synchronize()
+        return time.perf_counter()

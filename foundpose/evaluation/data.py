@@ -11,8 +11,9 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
+from foundpose.batch_size import BatchSize, check_batch_size, measure_batch_size
 from foundpose.bop import BopDataset, Instance
-from foundpose.evaluation.shards import read_shards
+from foundpose.evaluation.shards import keep_batch_size, read_batch_size, read_shards
 from foundpose.objects import DatasetObjects
 from foundpose.pictures import Photographs
 from foundpose.progress import ProgressBars
@@ -60,8 +61,7 @@ def plan_batches(
     """
     if batch_size < 1:
         raise ValueError(f"batch_size must be at least 1, got {batch_size}")
-    if order not in get_args(Order):
-        raise ValueError(f"order must be one of {get_args(Order)}, got {order!r}")
+    _check_order(order)
 
     def key(instance: Instance) -> tuple[int, ...]:
         image = (instance.scene_id, instance.im_id)
@@ -69,6 +69,11 @@ def plan_batches(
 
     ordered = sorted(instances, key=key)
     return [ordered[i : i + batch_size] for i in range(0, len(ordered), batch_size)]
+
+
+def _check_order(order: str) -> None:
+    if order not in get_args(Order):
+        raise ValueError(f"order must be one of {get_args(Order)}, got {order!r}")
 
 
 class InstanceBatches(Dataset[PoseBatch]):
@@ -161,7 +166,8 @@ class PoseDataModule(pl.LightningDataModule):
         objects: representations.
         folder: the run's folder, whose shards tell what is done.
         pictures: makes pictures; the dataset's photographs by default.
-        batch_size: instances in a batch.
+        batch_size: instances in a batch; "auto" finds out before the start how many the device has memory for, and
+            keeps the number in the folder, for the other processes and for runs that go on there.
         order: "image" or "object", see :func:`plan_batches`.
         object_ids: estimate only these objects.
         max_images: estimate only the first so many of the targets' images.
@@ -176,7 +182,7 @@ class PoseDataModule(pl.LightningDataModule):
         objects: DatasetObjects,
         folder: str | Path,
         pictures: Callable[[BopDataset, int, int], Tensor] | None = None,
-        batch_size: int = 16,
+        batch_size: BatchSize = 16,
         order: Order = "image",
         object_ids: Sequence[int] | None = None,
         max_images: int | None = None,
@@ -184,6 +190,8 @@ class PoseDataModule(pl.LightningDataModule):
         prepare_data_per_node: bool = False,
     ) -> None:
         super().__init__()
+        check_batch_size(batch_size)
+        _check_order(order)
         # Towards the end of a run there may be fewer batches than processes.
         self.allow_zero_length_dataloader_with_multiple_devices = True
         self.dataset = dataset
@@ -191,14 +199,35 @@ class PoseDataModule(pl.LightningDataModule):
         self.objects = objects
         self.folder = Path(folder)
         self.pictures = Photographs() if pictures is None else pictures
-        self.batch_size = batch_size
+        self.batch_size: BatchSize = batch_size
         self.order: Order = order
         self.object_ids = object_ids
         self.max_images = max_images
         self.num_workers = num_workers
         self.prepare_data_per_node = prepare_data_per_node
+        self._instances: list[Instance] | None = None
         self._batches: list[list[Instance]] | None = None
         self._remaining: list[int] | None = None
+
+    @property
+    def instances(self) -> list[Instance]:
+        """What to estimate.
+
+        Raises:
+            ValueError: there is nothing.
+        """
+        if self._instances is None:
+            wanted = set(self.dataset.object_ids if self.object_ids is None else self.object_ids)
+            images = set(self.dataset.images()[: self.max_images])
+            self._instances = [
+                i for i in self.masks(self.dataset) if i.obj_id in wanted and (i.scene_id, i.im_id) in images
+            ]
+            if not self._instances:
+                raise ValueError(
+                    f"nothing to estimate: the masks have no instance of the objects {sorted(wanted)} in the "
+                    f"{len(images)} images of {self.dataset.targets_path}"
+                )
+        return self._instances
 
     @property
     def batches(self) -> list[list[Instance]]:
@@ -206,27 +235,41 @@ class PoseDataModule(pl.LightningDataModule):
 
         Raises:
             ValueError: there is nothing to estimate.
+            RuntimeError: the size of batches is to be found out, which happens in :meth:`prepare_data`.
         """
         if self._batches is None:
-            wanted = set(self.dataset.object_ids if self.object_ids is None else self.object_ids)
-            images = set(self.dataset.images()[: self.max_images])
-            instances = [
-                i for i in self.masks(self.dataset) if i.obj_id in wanted and (i.scene_id, i.im_id) in images
-            ]
-            if not instances:
-                raise ValueError(
-                    f"nothing to estimate: the masks have no instance of the objects {sorted(wanted)} in the "
-                    f"{len(images)} images of {self.dataset.targets_path}"
-                )
-            self._batches = plan_batches(instances, self.batch_size, self.order)
+            batch_size = read_batch_size(self.folder) if self.batch_size == "auto" else self.batch_size
+            self._batches = plan_batches(self.instances, batch_size, self.order)
         return self._batches
 
     def prepare_data(self) -> None:
-        """Onboard the objects that are not onboarded yet, on the trainer's device."""
-        device = "cpu" if self.trainer is None else self.trainer.strategy.root_device
+        """Onboard the objects that are not onboarded yet, on the trainer's device, and find the size of batches."""
+        device = torch.device("cpu") if self.trainer is None else self.trainer.strategy.root_device
         self.objects.store.onboarder.to(device)
-        ids = sorted({instance.obj_id for batch in self.batches for instance in batch})
+        ids = sorted({instance.obj_id for instance in self.instances})
         self.objects.onboard(ids, ProgressBars)
+        if self.batch_size == "auto":
+            keep_batch_size(self.folder, lambda: self._measure_batch_size(device))
+
+    def _measure_batch_size(self, device: torch.device) -> int:
+        """How many instances the module that predicts can take at a time."""
+        estimate = None if self.trainer is None else getattr(self.trainer.lightning_module, "estimate", None)
+        if self.trainer is None or estimate is None:
+            raise RuntimeError("batch_size='auto' needs trainer.predict with a PoseEvaluation to try")
+        self.trainer.lightning_module.to(device).eval()
+        first = plan_batches(self.instances, len(self.instances), self.order)[0]
+
+        def run(samples: int) -> None:
+            # A short dataset fills a batch by repeating itself.
+            batch = [first[i % len(first)] for i in range(samples)]
+            read = InstanceBatches(self.dataset, self.pictures, [batch])[0]
+            with torch.no_grad():
+                estimate(self.transfer_batch_to_device(read, device, 0))
+
+        processes = self.trainer.num_devices if device.type == "cpu" else 1
+        # Every process is to get a batch.
+        share = len(self.instances) // self.trainer.world_size
+        return measure_batch_size(run, device, processes, share)
 
     def setup(self, stage: str) -> None:
         """Find out what remains to be done.

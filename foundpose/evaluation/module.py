@@ -27,7 +27,8 @@ class PoseEvaluation(pl.LightningModule):
         pipeline: the method.
         objects: representations and, for refiners, meshes.
         folder: the run's folder; shards go into it.
-        time_stages: measure every stage (synchronises GPUs around each) and not the whole alone.
+        time_stages: measure every stage, which makes the program wait for the GPU around each, and not the whole
+            alone.
     """
 
     def __init__(
@@ -67,24 +68,26 @@ class PoseEvaluation(pl.LightningModule):
         representations = dict(zip(ids, self.objects.representations(ids, self.device), strict=True))
         seconds = {"waiting": waiting, "representations": time.perf_counter() - start}
         records: list[dict[str, Any]] = [{} for _ in batch.instances]
-        modules = self._modules_to_time()
-        with StageTimer(modules) as timer:
+        pipeline = 0.0
+        stages = self._stages() if self.time_stages else {}
+        with StageTimer(stages) as timer:
             for members in _same_size(batch):
-                before = timer.seconds["pipeline"]
-                poses = self._run(batch, members, representations)
-                share = (timer.seconds["pipeline"] - before) / len(members)
+                poses, spent = self._run(batch, members, representations)
+                pipeline += spent
                 for i, pose in zip(members, poses, strict=True):
-                    records[i] = instance_record(batch.instances[i]) | pose | {"seconds": share}
-        seconds |= {name: timer.seconds[name] for name in modules}
+                    record = instance_record(batch.instances[i]) | pose
+                    records[i] = record | {"seconds": spent / len(members)}
+        seconds |= {"pipeline": pipeline} | {name: timer.seconds[name] for name in stages}
         return BatchRecord(batch.number, records, seconds)
 
     def _run(
         self, batch: PoseBatch, members: list[int], representations: dict[int, Any]
-    ) -> list[dict[str, Any]]:
-        """Poses of some regions, whose images have one size."""
+    ) -> tuple[list[dict[str, Any]], float]:
+        """Poses of some regions, whose images have one size, and the time that took."""
         images = sorted({batch.image_index[i] for i in members})
         ids = sorted({batch.object_ids[i] for i in members})
         meshes = None if self.pipeline.refiner is None else [self.objects.mesh(obj_id) for obj_id in ids]
+        start = time.perf_counter()
         estimates = self.pipeline(
             torch.stack([batch.images[i] for i in images]),
             batch.K[images],
@@ -94,14 +97,12 @@ class PoseEvaluation(pl.LightningModule):
             object_index=torch.tensor([ids.index(batch.object_ids[i]) for i in members]),
             meshes=meshes,
         )
-        return pose_records(estimates)
+        records = pose_records(estimates)  # waits for the poses, so the clock need not
+        return records, time.perf_counter() - start
 
-    def _modules_to_time(self) -> dict[str, nn.Module]:
-        modules: dict[str, nn.Module] = {"pipeline": self.pipeline}
-        if self.time_stages:
-            stages = {name: getattr(self.pipeline, name) for name in _STAGES}
-            modules |= {name: module for name, module in stages.items() if module is not None}
-        return modules
+    def _stages(self) -> dict[str, nn.Module]:
+        stages = {name: getattr(self.pipeline, name) for name in _STAGES}
+        return {name: module for name, module in stages.items() if module is not None}
 
 
 def estimate_dataset(trainer: pl.Trainer, module: PoseEvaluation, data: PoseDataModule) -> None:

@@ -78,7 +78,7 @@ def _estimate(
         object_ids=wanted,
         max_images=cfg.max_images,
     )
-    batches = data.batches
+    found = data.instances
     claim_run_folder(output, cfg, MAY_CHANGE)
     logging.getLogger("pytorch_lightning.utilities.rank_zero").setLevel(logging.WARNING)
     trainer: pl.Trainer = instantiate(cfg.trainer, default_root_dir=output)
@@ -93,11 +93,9 @@ def _estimate(
     if not trainer.is_global_zero:
         return None
 
-    done = merge_shards(output, batches)
+    done = merge_shards(output, data.batches)
     write_json(output / "timing.json", timing(done, trainer.strategy.root_device))
-    write_json(
-        output / "memory.json", memory(objects, sorted({i.obj_id for batch in batches for i in batch}))
-    )
+    write_json(output / "memory.json", memory(objects, sorted({i.obj_id for i in found})))
     records = all_records(done)
     write_json(output / "estimates.json", records)
     results = best_results(to_results(records), dataset.targets())

@@ -2,11 +2,14 @@
 
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from filelock import FileLock
+
 from foundpose.bop import Instance
+from foundpose.io import write_json
 from foundpose.records import instance_record
 
 
@@ -97,3 +100,38 @@ def _check_plan(path: Path, batch: BatchRecord, batches: Sequence[Sequence[Insta
         f"batch {batch.number} in {path} has other instances than the targets and masks of now: the dataset's files "
         "have changed since the run began; give another hydra.run.dir"
     )
+
+
+def keep_batch_size(folder: Path, measure: Callable[[], int]) -> None:
+    """Measure the size of a run's batches and record it in its folder, unless it is there."""
+    path = _batch_size_path(folder)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # Where nodes have file systems of their own for representations, several processes come here.
+    with FileLock(path.with_suffix(".lock")):
+        if not path.is_file():
+            write_json(path, {"batch_size": measure()})
+
+
+def read_batch_size(folder: Path) -> int:
+    """The size of batches that a run's folder records.
+
+    Raises:
+        RuntimeError: none yet.
+        ValueError: the record is damaged.
+    """
+    path = _batch_size_path(folder)
+    if not path.is_file():
+        raise RuntimeError(f"batch_size='auto' is found out when a run starts, and {path} is not there yet")
+    try:
+        size = json.loads(path.read_text())["batch_size"]
+        if not isinstance(size, int) or size < 1:
+            raise ValueError(f"batch_size is {size!r}")
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(
+            f"{path} is damaged ({error}); delete it, and the folder's shards, to start anew"
+        ) from error
+    return size
+
+
+def _batch_size_path(folder: Path) -> Path:
+    return folder / "batch_size.json"

@@ -147,6 +147,10 @@ class AdaptedExtractor(PatchExtractor):
         patches = self.adapter(features.patches.movedim(1, -1)).movedim(-1, 1)
         return features._replace(patches=patches)
 
+    def running_precision(self) -> str | None:
+        """The inner extractor's."""
+        return self.extractor.running_precision()
+
     def fingerprint(self) -> Fingerprint:
         """The inner extractor's, the adapter's architecture and a checksum of its weights."""
         return self.extractor.fingerprint() | {

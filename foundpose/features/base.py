@@ -49,6 +49,14 @@ class PatchExtractor(nn.Module, ABC):
     def fingerprint(self) -> Fingerprint:
         """Settings that change the descriptors; an object representation is valid for one fingerprint only."""
 
+    def running_precision(self) -> str | None:
+        """Type that inference rounds to inside ("bf16", "fp16"); None for that of the weights.
+
+        What was made in one type is not reused in another, though the fingerprint, and so what may be compared with
+        what, is the same.
+        """
+        return None
+
     def grid_size(self, image_size: int) -> int:
         """Number of patches along one side of an image of ``image_size`` pixels; 0 where not one fits."""
         return max(0, math.floor((image_size - 1 - 2 * self.offset) / self.stride + 1e-6) + 1)

@@ -69,9 +69,11 @@ class Clip(PretrainedExtractor):
         final_norm: apply the LayerNorm that the model has for the class token of its last block to all tokens.
         weights: ``"hub"`` (Hugging Face hub or its cache), a folder in transformers' format, or ``"random"`` (with
             ``seed``; for tests and dry runs).
-        precision: ``"bf16"`` or ``"fp16"`` runs the model under autocast; None in the weights' own precision.
+        precision: ``"bf16"`` or ``"fp16"`` runs the model under autocast, ``"auto"`` in what the device gains from
+            (in inference only); None in the weights' own precision.
         seed: of random weights, and only of these.
         config: sizes that differ from the variant's, names as in ``ClipArchitecture``.
+        compile: compile the model, see ``PretrainedExtractor``.
 
     Raises:
         ValueError: unknown variant, layer or precision; weights that do not fit the variant.
@@ -90,6 +92,7 @@ class Clip(PretrainedExtractor):
         precision: str | None = None,
         seed: int | None = None,
         config: Mapping[str, ConfigValue] | None = None,
+        compile: bool = False,
     ) -> None:
         architecture = resolve_architecture(VARIANTS, variant, config, layer, weights, precision, seed)
         model = _load(weights, seed, build_config(architecture, layer + 1), architecture, variant)
@@ -97,7 +100,9 @@ class Clip(PretrainedExtractor):
             _encoder(model).post_layernorm = nn.Identity()
         settings: Fingerprint = {"variant": variant, "layer": layer, "final_norm": final_norm}
         width = architecture.hidden_size
-        super().__init__(model, width, settings, True, precision, mean=CLIP_MEAN, std=CLIP_STD)
+        super().__init__(
+            model, width, settings, True, precision, mean=CLIP_MEAN, std=CLIP_STD, compile=compile
+        )
         self.patch_size = architecture.patch_size
 
     def input_size(self, image_size: int) -> int:

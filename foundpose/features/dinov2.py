@@ -31,9 +31,11 @@ class DinoV2(PretrainedExtractor):
         final_norm: apply the model's final LayerNorm to these tokens, as the released code does.
         weights: ``"hub"`` (Hugging Face hub or its cache), a folder in transformers' format, an original ``.pth``
             checkpoint, or ``"random"`` (with ``seed``; for tests and dry runs).
-        precision: ``"bf16"`` or ``"fp16"`` runs the model under autocast; None in the weights' own precision.
+        precision: ``"bf16"`` or ``"fp16"`` runs the model under autocast, ``"auto"`` in what the device gains from
+            (in inference only); None in the weights' own precision.
         seed: of random weights, and only of these.
         config: sizes that differ from the variant's, names as in ``DinoV2Architecture``.
+        compile: compile the model, see ``PretrainedExtractor``.
 
     Raises:
         ValueError: unknown variant, layer or precision; weights that do not fit the variant.
@@ -52,6 +54,7 @@ class DinoV2(PretrainedExtractor):
         precision: str | None = None,
         seed: int | None = None,
         config: Mapping[str, ConfigValue] | None = None,
+        compile: bool = False,
     ) -> None:
         architecture = resolve_architecture(VARIANTS, variant, config, layer, weights, precision, seed)
         if bool(architecture.num_register_tokens) != variant.endswith("_reg"):
@@ -65,7 +68,9 @@ class DinoV2(PretrainedExtractor):
         if not final_norm:
             model.layernorm = nn.Identity()
         settings: Fingerprint = {"variant": variant, "layer": layer, "final_norm": final_norm}
-        super().__init__(model, architecture.hidden_size, settings, has_cls=True, precision=precision)
+        super().__init__(
+            model, architecture.hidden_size, settings, has_cls=True, precision=precision, compile=compile
+        )
         self.variant = variant
         self.layer = layer
         self.final_norm = final_norm
@@ -80,9 +85,10 @@ class DinoV2(PretrainedExtractor):
         precision: str | None = None,
         seed: int = 0,
         config: Mapping[str, ConfigValue] | None = None,
+        compile: bool = False,
     ) -> Self:
         """An extractor with random weights, the same for the same seed: for tests and dry runs."""
-        return cls(variant, layer, final_norm, "random", precision, seed, config)
+        return cls(variant, layer, final_norm, "random", precision, seed, config, compile)
 
     def input_size(self, image_size: int) -> int:
         """The images' own size: the network's patches are those of the grid."""

@@ -67,9 +67,11 @@ class DinoV3(PretrainedExtractor):
         final_norm: apply the model's final LayerNorm to these tokens.
         weights: ``"hub"`` (Hugging Face hub or its cache), a folder in transformers' format, or ``"random"`` (with
             ``seed``; for tests and dry runs).
-        precision: ``"bf16"`` or ``"fp16"`` runs the model under autocast; None in the weights' own precision.
+        precision: ``"bf16"`` or ``"fp16"`` runs the model under autocast, ``"auto"`` in what the device gains from
+            (in inference only); None in the weights' own precision.
         seed: of random weights, and only of these.
         config: sizes that differ from the variant's, names as in ``DinoV3Architecture``.
+        compile: compile the model, see ``PretrainedExtractor``.
 
     Raises:
         ValueError: unknown variant, layer or precision; weights that do not fit the variant.
@@ -87,13 +89,16 @@ class DinoV3(PretrainedExtractor):
         precision: str | None = None,
         seed: int | None = None,
         config: Mapping[str, ConfigValue] | None = None,
+        compile: bool = False,
     ) -> None:
         architecture = resolve_architecture(VARIANTS, variant, config, layer, weights, precision, seed)
         model = _load(weights, seed, build_config(architecture, layer + 1), architecture, variant)
         if not final_norm:
             model.norm = nn.Identity()
         settings: Fingerprint = {"variant": variant, "layer": layer, "final_norm": final_norm}
-        super().__init__(model, architecture.hidden_size, settings, has_cls=True, precision=precision)
+        super().__init__(
+            model, architecture.hidden_size, settings, has_cls=True, precision=precision, compile=compile
+        )
         self.num_prefix_tokens = 1 + architecture.num_register_tokens
 
     def input_size(self, image_size: int) -> int:

@@ -34,8 +34,10 @@ class LoftrBackbone(PretrainedExtractor):
         level: ``coarse``, the last layer, of 1/8 resolution and 256 channels; ``fine``, 1/2 and 128.
         weights: ``"hub"`` (kornia's download or its cache), a checkpoint file (``loftr_outdoor.ckpt``), or
             ``"random"`` (with ``seed``; for tests and dry runs).
-        precision: ``"bf16"`` or ``"fp16"`` runs the model under autocast; None in the weights' own precision.
+        precision: ``"bf16"`` or ``"fp16"`` runs the model under autocast, ``"auto"`` in what the device gains from
+            (in inference only); None in the weights' own precision.
         seed: of random weights, and only of these.
+        compile: compile the model, see ``PretrainedExtractor``.
 
     Raises:
         ValueError: unknown variant, level or precision; a file with other weights.
@@ -52,6 +54,7 @@ class LoftrBackbone(PretrainedExtractor):
         weights: str | Path = "hub",
         precision: str | None = None,
         seed: int | None = None,
+        compile: bool = False,
     ) -> None:
         if variant not in VARIANTS:
             raise ValueError(f"variant must be one of {', '.join(VARIANTS)}, got {variant!r}")
@@ -67,7 +70,9 @@ class LoftrBackbone(PretrainedExtractor):
         channels, map_stride = _LEVELS[level]
         settings: Fingerprint = {"variant": variant, "level": level}
         # grey values of 0..1 go in as they are
-        super().__init__(model, channels, settings, False, precision, mean=(0, 0, 0), std=(1, 1, 1))
+        super().__init__(
+            model, channels, settings, False, precision, mean=(0, 0, 0), std=(1, 1, 1), compile=compile
+        )
         self.level = level
         self.map_stride = map_stride
 

@@ -116,6 +116,10 @@ class PatchNoise(PatchExtractor):
         scale = patches.detach().square().mean(dim=(1, 2, 3), keepdim=True).sqrt()
         return features._replace(patches=torch.where(hit.to(patches.device), noise * scale, patches))
 
+    def running_precision(self) -> str | None:
+        """The disturbed extractor's."""
+        return self.extractor.running_precision()
+
     def fingerprint(self) -> Fingerprint:
         """The fingerprint of the disturbed extractor."""
         return self.extractor.fingerprint()

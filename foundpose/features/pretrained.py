@@ -1,15 +1,16 @@
 """What the extractors that run a pretrained network have in common."""
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Self
+from typing import Any, Self, cast
 
 import torch
 from torch import Tensor, nn
 
 from foundpose.features.base import Fingerprint, PatchExtractor, PatchFeatures
 from foundpose.features.checks import check_images
+from foundpose.features.precision import autocast_dtype, autocast_precision, check_precision
 from foundpose.features.resample import on_grid, resize_images
 from foundpose.features.weights import (
     ConfigValue,
@@ -23,7 +24,10 @@ from foundpose.features.weights import (
 PATCH_SIZE = 14
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
-_AUTOCAST = {"bf16": torch.bfloat16, "fp16": torch.float16}
+
+
+class CompilationError(ValueError):
+    """``torch.compile`` does not work on this machine; the message says what it needs."""
 
 
 class PretrainedExtractor(PatchExtractor):
@@ -39,12 +43,18 @@ class PretrainedExtractor(PatchExtractor):
         channels: length C of a descriptor.
         settings: what the fingerprint says besides the weights.
         has_cls: whether ``describe`` gives a global descriptor.
-        precision: ``"bf16"`` or ``"fp16"`` runs the network under autocast; None in the weights' own precision.
+        precision: ``"bf16"`` or ``"fp16"`` runs the network under autocast, ``"auto"`` under the type that the device
+            gains from and without gradients only (:func:`foundpose.features.precision.autocast_dtype`), None in the
+            weights' own precision.
         mean: of the network's training images, per channel, for values in [0, 1].
         std: their standard deviation.
+        compile: compile the network with ``torch.compile``, anew for each size and number of images (which takes half
+            a minute or more), so give it batches of few different lengths: beyond eight PyTorch goes back to running
+            the network as it is. A copy or an unpickled extractor compiles again.
 
     Raises:
         ValueError: unknown precision.
+        CompilationError: (on a call) ``compile`` where there is no compiler.
     """
 
     mean: Tensor
@@ -59,12 +69,16 @@ class PretrainedExtractor(PatchExtractor):
         precision: str | None,
         mean: Sequence[float] = IMAGENET_MEAN,
         std: Sequence[float] = IMAGENET_STD,
+        compile: bool = False,
     ) -> None:
+        check_precision(precision)
         super().__init__(channels, stride=PATCH_SIZE, offset=(PATCH_SIZE - 1) / 2)
         self.model = model.eval()
         self.settings = dict(settings)
         self.has_cls = has_cls
         self.precision = precision
+        self.compiled = compile
+        self._compiled: Callable[[Tensor], PatchFeatures] | None = None
         self.register_buffer("mean", torch.tensor(mean).view(3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(std).view(3, 1, 1), persistent=False)
 
@@ -109,11 +123,33 @@ class PretrainedExtractor(PatchExtractor):
         pixels = images.to(torch.promote_types(images.dtype, self.mean.dtype))
         pixels = (resize_images(pixels, self.input_size(size)) - self.mean) / self.std
         pixels = pixels.to(next(self.model.parameters()).dtype)
-        autocast = _AUTOCAST.get(self.precision) if self.precision else None
+        autocast = autocast_dtype(self.precision, images.device)
         with torch.autocast(images.device.type, dtype=autocast, enabled=autocast is not None):
-            patches, cls = self.describe(pixels)
+            patches, cls = self._describe_compiled(pixels) if self.compiled else self.describe(pixels)
         cls = None if cls is None else cls.to(images.dtype)
         return PatchFeatures(on_grid(patches, n).to(images.dtype), cls)
+
+    def _describe_compiled(self, pixels: Tensor) -> PatchFeatures:
+        """What :meth:`describe` returns, compiled on the first call."""
+        from torch._dynamo.exc import TorchDynamoException
+
+        if self._compiled is None:
+            self._compiled = torch.compile(self.describe, dynamic=False)
+        try:
+            return self._compiled(pixels)
+        except TorchDynamoException as error:
+            raise CompilationError(
+                f"torch.compile failed ({str(error).strip().splitlines()[0]}); on a CPU it needs a C++ compiler (g++ "
+                "or clang), on a GPU triton and a C compiler. Set compile=false to do without"
+            ) from error
+
+    def __getstate__(self) -> dict[str, Any]:
+        # What is compiled runs the weights of the extractor that it was compiled for.
+        return {**cast(dict[str, Any], super().__getstate__()), "_compiled": None}
+
+    def running_precision(self) -> str | None:
+        """ "bf16" or "fp16" where inference runs under autocast, with "auto" resolved for the network's device."""
+        return autocast_precision(self.precision, self.mean.device)
 
     def fingerprint(self) -> Fingerprint:
         """The settings and a checksum of the weights as they are now; not the precision.
@@ -134,13 +170,8 @@ class PretrainedExtractor(PatchExtractor):
 
     def extra_repr(self) -> str:
         """Shown by ``print``."""
-        return ", ".join(f"{k}={v!r}" for k, v in {**self.settings, "precision": self.precision}.items())
-
-
-def check_precision(precision: str | None) -> None:
-    """Raise ValueError for a precision that is none of None, 'bf16' and 'fp16'."""
-    if precision is not None and precision not in _AUTOCAST:
-        raise ValueError(f"precision must be None, 'bf16' or 'fp16', got {precision!r}")
+        shown = {**self.settings, "precision": self.precision, "compile": self.compiled}
+        return ", ".join(f"{k}={v!r}" for k, v in shown.items())
 
 
 def resolve_architecture(

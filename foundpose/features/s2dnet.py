@@ -33,8 +33,10 @@ class S2DNet(PretrainedExtractor):
     Args:
         layers: any of ``conv1_2``, ``conv3_3``, ``conv5_3``; the paper takes the last.
         weights: the published ``s2dnet_weights.pth``, or ``"random"`` (with ``seed``; for tests and dry runs).
-        precision: ``"bf16"`` or ``"fp16"`` runs the model under autocast; None in the weights' own precision.
+        precision: ``"bf16"`` or ``"fp16"`` runs the model under autocast, ``"auto"`` in what the device gains from
+            (in inference only); None in the weights' own precision.
         seed: of random weights, and only of these.
+        compile: compile the model, see ``PretrainedExtractor``.
 
     Raises:
         ValueError: unknown layer or precision; a file with other weights.
@@ -50,6 +52,7 @@ class S2DNet(PretrainedExtractor):
         weights: str | Path = "s2dnet_weights.pth",
         precision: str | None = None,
         seed: int | None = None,
+        compile: bool = False,
     ) -> None:
         unknown = [name for name in layers if name not in LAYERS]
         if not layers or unknown or len(set(layers)) < len(layers):
@@ -66,7 +69,9 @@ class S2DNet(PretrainedExtractor):
             checkpoint = read_checkpoint(Path(weights), _HOW)
             load_state(network, checkpoint.get("state_dict", checkpoint), Path(weights), _HOW)
         settings: Fingerprint = {"layers": " ".join(ordered)}
-        super().__init__(network, _CHANNELS * len(ordered), settings, has_cls=False, precision=precision)
+        super().__init__(
+            network, _CHANNELS * len(ordered), settings, has_cls=False, precision=precision, compile=compile
+        )
 
     def input_size(self, image_size: int) -> int:
         """16 px per patch of the grid."""

@@ -65,9 +65,11 @@ class Sam(PretrainedExtractor):
         layer: block whose output is taken, counted from 0.
         weights: ``"hub"`` (Hugging Face hub or its cache), a folder in transformers' format, with or without the
             mask decoder, or ``"random"`` (with ``seed``; for tests and dry runs).
-        precision: ``"bf16"`` or ``"fp16"`` runs the model under autocast; None in the weights' own precision.
+        precision: ``"bf16"`` or ``"fp16"`` runs the model under autocast, ``"auto"`` in what the device gains from
+            (in inference only); None in the weights' own precision.
         seed: of random weights, and only of these.
         config: sizes that differ from the variant's, names as in ``SamArchitecture``.
+        compile: compile the model, see ``PretrainedExtractor``.
 
     Raises:
         ValueError: unknown variant, layer or precision; weights that do not fit the variant.
@@ -84,12 +86,15 @@ class Sam(PretrainedExtractor):
         precision: str | None = None,
         seed: int | None = None,
         config: Mapping[str, ConfigValue] | None = None,
+        compile: bool = False,
     ) -> None:
         architecture = resolve_architecture(VARIANTS, variant, config, layer, weights, precision, seed)
         model = _load(weights, seed, build_config(architecture, layer + 1), architecture, variant)
         model.get_submodule("vision_encoder").neck = nn.Identity()
         settings: Fingerprint = {"variant": variant, "layer": layer}
-        super().__init__(model, architecture.hidden_size, settings, has_cls=False, precision=precision)
+        super().__init__(
+            model, architecture.hidden_size, settings, has_cls=False, precision=precision, compile=compile
+        )
         self.image_size = architecture.image_size
 
     def input_size(self, image_size: int) -> int:

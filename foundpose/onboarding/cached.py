@@ -11,8 +11,9 @@ from foundpose.features.pca import PcaProjection
 from foundpose.onboarding.artefacts import ArtefactStore
 from foundpose.onboarding.compression import PackedPictures, join_pictures, pack_pictures, unpack_pictures
 from foundpose.onboarding.onboarder import Onboarder
+from foundpose.onboarding.prefetch import pin
 from foundpose.onboarding.representation import ObjectRepresentation
-from foundpose.onboarding.stages import FittedWords, PatchTable, Progress, ignore_progress
+from foundpose.onboarding.stages import FittedWords, PatchTable, Progress, TemplatePictures, ignore_progress
 from foundpose.onboarding.templates import TemplateCameras
 from foundpose.rendering import Mesh
 
@@ -83,7 +84,7 @@ class CachedOnboarding:
         descriptors = {
             "patches": self.artefacts.key("patches", patches),
             "extractor": self.fingerprint,
-            "precision": getattr(extractor, "precision", None),
+            "precision": extractor.running_precision(),
         }
         words = {
             "descriptors": self.artefacts.key("descriptors", descriptors),
@@ -101,12 +102,13 @@ class CachedOnboarding:
 
         def make() -> Mapping[str, Tensor]:
             cameras = onboarder.cameras(mesh)
-            packed = join_pictures(
-                [
-                    pack_pictures(*onboarder.render(mesh, batch), onboarder.renderer.bits)
-                    for batch, _ in onboarder.batches(cameras, "renderings", report)
-                ]
-            )
+
+            def prepare(batch: TemplateCameras, _: slice) -> TemplatePictures:
+                return onboarder.render(mesh, batch)
+
+            with onboarder.batches(cameras, prepare, "renderings", report) as batches:
+                bits = onboarder.renderer.bits
+                packed = join_pictures([pack_pictures(*pictures, bits) for pictures, _ in batches])
             return cameras._asdict() | packed._asdict()
 
         tensors = self._get("renderings", mesh, make)
@@ -115,10 +117,9 @@ class CachedOnboarding:
         )
 
     def _unpack(self, packed: PackedPictures, rows: slice) -> tuple[Tensor, Tensor]:
-        """Pictures and masks of some templates, on the extractor's device."""
+        """Pictures and masks of some templates."""
         size = (self.onboarder.image_size, self.onboarder.image_size)
-        levels, masks = unpack_pictures(packed, rows, size, self.onboarder.renderer.bits)
-        return levels.to(self.onboarder.device), masks.to(self.onboarder.device)
+        return unpack_pictures(packed, rows, size, self.onboarder.renderer.bits)
 
     def _patches(self, mesh: Mesh, report: Progress) -> tuple[TemplateCameras, PatchTable]:
         """Cameras of all templates and their valid patches."""
@@ -126,10 +127,12 @@ class CachedOnboarding:
 
         def make() -> Mapping[str, Tensor]:
             cameras, packed = self._renderings(mesh, report)
-            tables = [
-                onboarder.register(mesh, batch, self._unpack(packed, rows)[1])
-                for batch, rows in onboarder.batches(cameras, "patches", report)
-            ]
+
+            def prepare(batch: TemplateCameras, rows: slice) -> PatchTable:
+                return onboarder.register(mesh, batch, self._unpack(packed, rows)[1])
+
+            with onboarder.batches(cameras, prepare, "patches", report) as batches:
+                tables = [table for table, _ in batches]
             table = PatchTable(*(torch.cat(parts) for parts in zip(*tables, strict=True)))
             return cameras._asdict() | table._asdict()
 
@@ -141,26 +144,30 @@ class CachedOnboarding:
     def _descriptors(self, mesh: Mesh, report: Progress) -> tuple[list[Tensor], Tensor]:
         """Descriptors of each batch of templates, and all global ones."""
         onboarder = self.onboarder
+        device = onboarder.device
         _, patches = self._patches(mesh, report)
         counts = patches.counts
         ends = [0, *counts.cumsum(0).tolist()]
 
         def make() -> Mapping[str, Tensor]:
             cameras, packed = self._renderings(mesh, report)
-            # Filled batch by batch: joining a list would take the memory twice.
-            descriptors = torch.empty(ends[-1], onboarder.extractor.channels)
-            cls = []
-            for _, rows in onboarder.batches(cameras, "templates", report):
+
+            def prepare(_: TemplateCameras, rows: slice) -> tuple[Tensor, PatchTable]:
                 of_batch = slice(ends[rows.start], ends[rows.stop])
                 table = PatchTable(
                     patches.points_model[of_batch], patches.patch_index[of_batch], counts[rows]
                 )
-                levels, _ = self._unpack(packed, rows)
-                described = onboarder.describe(
-                    levels, PatchTable(*(part.to(onboarder.device) for part in table))
-                )
-                descriptors[of_batch] = described.descriptors.cpu()
-                cls.append(described.template_cls.cpu())
+                levels = self._unpack(packed, rows)[0]
+                return pin(levels, device), PatchTable(*(pin(part, device) for part in table))
+
+            # Filled batch by batch: joining a list would take the memory twice.
+            descriptors = torch.empty(ends[-1], onboarder.extractor.channels, device=device)
+            cls = []
+            with onboarder.batches(cameras, prepare, "templates", report) as batches:
+                for (levels, table), rows in batches:
+                    described = onboarder.describe(levels, table)
+                    descriptors[ends[rows.start] : ends[rows.stop]] = described.descriptors
+                    cls.append(described.template_cls)
             return {"descriptors": descriptors, "template_cls": torch.cat(cls)}
 
         tensors = self._get("descriptors", mesh, make)

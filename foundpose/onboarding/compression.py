@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 _ARRAY_TYPES: dict[int, type[np.unsignedinteger]] = {8: np.uint8, 16: np.uint16}
+# PyTorch computes little with 16 bits without a sign.
+_TENSOR_TYPES = {8: torch.uint8, 16: torch.int32}
 # Higher levels take several times as long and save a tenth.
 _FAST = 1
 
@@ -28,8 +30,8 @@ class PackedPictures(NamedTuple):
 
 
 def quantize(rgb: Tensor, bits: int) -> Tensor:
-    """Round colours in [0, 1] to integers in [0, 2^bits − 1], as a camera does; int32."""
-    return (rgb * (2**bits - 1)).round().to(torch.int32)
+    """Round colours in [0, 1] to integers in [0, 2^bits − 1], as a camera does; uint8 or, for 16 bits, int32."""
+    return (rgb * (2**bits - 1)).round_().to(_TENSOR_TYPES[bits])
 
 
 def dequantize(levels: Tensor, bits: int) -> Tensor:
@@ -81,14 +83,14 @@ def unpack_pictures(
         bits: 8 or 16, as when they were packed.
 
     Returns:
-        Integers (n, 3, H, W), int32, and masks (n, H, W), on the CPU.
+        Integers (n, 3, H, W), in the type of :func:`quantize`, and masks (n, H, W), on the CPU.
     """
     chosen = range(*rows.indices(len(packed.boxes)))
     dtype = np.dtype(_ARRAY_TYPES[bits])
-    levels = np.zeros((len(chosen), 3, *size), np.int32)
+    levels = torch.zeros(len(chosen), 3, *size, dtype=_TENSOR_TYPES[bits])
     masks = np.zeros((len(chosen), *size), np.bool_)
     offsets = packed.offsets.tolist()
-    for picture, mask, i in zip(levels, masks, chosen, strict=True):
+    for picture, mask, i in zip(levels.numpy(), masks, chosen, strict=True):
         top, left, height, width = packed.boxes[i].tolist()
         inside = np.s_[..., top : top + height, left : left + width]
         stream = packed.streams[offsets[i] : offsets[i + 1]]
@@ -97,7 +99,7 @@ def unpack_pictures(
         picture[inside] = _from_bytes(content[:count], (3, height, width), dtype)
         bitmap = np.frombuffer(content[count:], np.uint8)
         mask[inside] = np.unpackbits(bitmap, count=height * width).reshape(height, width)
-    return torch.from_numpy(levels), torch.from_numpy(masks)
+    return levels, torch.from_numpy(masks)
 
 
 def _bounding_box(occupied: NDArray[np.bool_]) -> tuple[int, int, int, int]:

@@ -1,17 +1,21 @@
 """From a mesh to an object representation."""
 
 import copy
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import chain
-from typing import Literal, get_args
+from typing import TypeVar, get_args
 
 import torch
 from torch import Tensor, nn
 
+from foundpose.batch_size import BatchSize, check_batch_size, measure_batch_size
 from foundpose.features.base import PatchExtractor
 from foundpose.features.pca import CovarianceAccumulator, PcaProjection
+from foundpose.onboarding.bags import describe_by_words
 from foundpose.onboarding.compression import dequantize, quantize
+from foundpose.onboarding.prefetch import pin, prefetch, upload
+from foundpose.onboarding.quantization import Storage, check_storage
 from foundpose.onboarding.representation import ObjectRepresentation, RepresentationInfo
 from foundpose.onboarding.stages import (
     FittedWords,
@@ -23,12 +27,9 @@ from foundpose.onboarding.stages import (
 )
 from foundpose.onboarding.templates import TemplateCameras, register_patches, template_cameras
 from foundpose.rendering import Mesh, Renderer
-from foundpose.retrieval import IdfMode, SoftAssignBow, VisualWords, WordAssignment
-from foundpose.retrieval.bow import inverse_document_frequency, tf_idf, word_counts
-from foundpose.retrieval.retriever import normalize_rows
+from foundpose.retrieval import IdfMode, SoftAssignBow, VisualWords
 
-Storage = Literal["float32", "float16"]
-_STORAGE_TYPES: dict[Storage, torch.dtype] = {"float32": torch.float32, "float16": torch.float16}
+_T = TypeVar("_T")
 
 
 class Onboarder(nn.Module):
@@ -49,9 +50,12 @@ class Onboarder(nn.Module):
         distance: distance of the templates' cameras in diameters.
         mask_erosion: template masks are eroded by a square of this many pixels (odd; 0 for none).
         idf_mode: "document" or "occurrence", see :func:`inverse_document_frequency`.
-        batch_size: templates that are rendered and described at a time.
-        storage: type in which the representation keeps the patches' descriptors. "float16" halves their memory;
+        batch_size: templates that are rendered and described at a time; "auto" finds out on first use how many the
+            device has memory for.
+        storage: how the representation keeps the patches' descriptors. "float16" halves their memory, "int8" quarters
+            it with a scale for each component, "pq" takes ``pq_subspaces`` bytes for each by product quantisation;
             computations are in float32 all the same.
+        pq_subspaces: bytes of a descriptor with ``storage="pq"``; divides the number of PCA components.
     """
 
     def __init__(
@@ -67,8 +71,9 @@ class Onboarder(nn.Module):
         distance: float = 6.0,
         mask_erosion: int = 5,
         idf_mode: IdfMode = "document",
-        batch_size: int = 16,
+        batch_size: BatchSize = 16,
         storage: Storage = "float32",
+        pq_subspaces: int = 64,
     ) -> None:
         super().__init__()
         projection = PcaProjection() if projection is None else projection
@@ -85,10 +90,8 @@ class Onboarder(nn.Module):
             raise ValueError(f"mask_erosion must be 0 or odd, got {mask_erosion}")
         if distance <= 1.0:
             raise ValueError(f"distance must be more than one diameter, got {distance}")
-        if batch_size < 1:
-            raise ValueError(f"batch_size must be at least 1, got {batch_size}")
-        if storage not in get_args(Storage):
-            raise ValueError(f"storage must be one of {get_args(Storage)}, got {storage!r}")
+        check_batch_size(batch_size)
+        check_storage(storage, pq_subspaces, projection.num_components)
         self.renderer = renderer
         self.extractor = extractor
         self.viewpoints = viewpoints
@@ -100,8 +103,9 @@ class Onboarder(nn.Module):
         self.distance = distance
         self.mask_erosion = mask_erosion
         self.idf_mode: IdfMode = idf_mode
-        self.batch_size = batch_size
+        self._batch_size: BatchSize = batch_size
         self.storage: Storage = storage
+        self.pq_subspaces = pq_subspaces
 
     def settings(self) -> dict[str, str | int | float | bool | None]:
         """Settings that the representation depends on, beside mesh and extractor."""
@@ -118,12 +122,30 @@ class Onboarder(nn.Module):
             "renderer": repr(self.renderer),
             "bits": self.renderer.bits,
             "storage": self.storage,
+            **({"pq_subspaces": self.pq_subspaces} if self.storage == "pq" else {}),
         }
 
     @property
     def device(self) -> torch.device:
         """Device of the extractor's parameters and buffers (the CPU if it has none); the stages compute there."""
         return next(chain(self.extractor.parameters(), self.extractor.buffers()), torch.empty(0)).device
+
+    @property
+    def batch_size(self) -> int:
+        """Templates that are rendered and described at a time.
+
+        Raises:
+            ValueError: it is "auto", and the device is one whose free memory cannot be told.
+        """
+        if self._batch_size == "auto":
+            with self.constants():
+                self._batch_size = measure_batch_size(self._try_batch, self.device)
+        return self._batch_size
+
+    @batch_size.setter
+    def batch_size(self, value: BatchSize) -> None:
+        check_batch_size(value)
+        self._batch_size = value
 
     def forward(self, mesh: Mesh, name: str, progress: Progress | None = None) -> ObjectRepresentation:
         """Onboard an object.
@@ -140,18 +162,27 @@ class Onboarder(nn.Module):
             ValueError: too few patches for the PCA or the words, or descriptors too large for ``storage``.
 
         Not differentiable: what comes out are constants of later stages.
+
+        Until the words are found a GPU holds the raw descriptors, 1 GB with a ViT-L and 800 templates;
+        :class:`CachedOnboarding` keeps them in files.
         """
         report = progress or ignore_progress
         with self.constants():
             cameras = self.cameras(mesh)
+            device = self.device
             tables, raw, cls = [], [], []
-            for batch, _ in self.batches(cameras, "templates", report):
+
+            def prepare(batch: TemplateCameras, _: slice) -> tuple[Tensor, PatchTable]:
                 pictures = self.render(mesh, batch)
                 table = self.register(mesh, batch, pictures.masks)
-                described = self.describe(pictures.levels, table)
-                tables.append(PatchTable(*(part.cpu() for part in table)))
-                raw.append(described.descriptors.cpu())
-                cls.append(described.template_cls.cpu())
+                return pin(pictures.levels, device), PatchTable(*(pin(part, device) for part in table))
+
+            with self.batches(cameras, prepare, "templates", report) as batches:
+                for (levels, table), _ in batches:
+                    described = self.describe(levels, table)
+                    tables.append(table)
+                    raw.append(described.descriptors)
+                    cls.append(described.template_cls)
             patches = PatchTable(*(torch.cat(parts) for parts in zip(*tables, strict=True)))
             fitted = self.fit(raw, report)
             return self.assemble(mesh, name, cameras, patches, torch.cat(cls), fitted, report)
@@ -166,20 +197,38 @@ class Onboarder(nn.Module):
         with torch.no_grad(), torch.autocast(self.device.type, enabled=False):
             yield
 
+    @contextmanager
     def batches(
-        self, cameras: TemplateCameras, stage: str, report: Progress
-    ) -> Iterator[tuple[TemplateCameras, slice]]:
-        """Cameras of ``batch_size`` templates at a time, and which templates; each is reported when done with."""
-        total = len(cameras.K_template)
-        report(stage, 0, total)
-        for start in range(0, total, self.batch_size):
-            rows = slice(start, min(start + self.batch_size, total))
-            yield TemplateCameras(*(part[rows].to(self.device) for part in cameras)), rows
-            report(stage, rows.stop, total)
+        self,
+        cameras: TemplateCameras,
+        prepare: Callable[[TemplateCameras, slice], _T],
+        stage: str,
+        report: Progress,
+    ) -> Iterator[Iterator[tuple[_T, slice]]]:
+        """What ``prepare`` makes of the cameras of ``batch_size`` templates at a time, and which templates these are.
+
+        Where the extractor has a processor of its own, the next batch is prepared while the caller works on the last
+        one. On the CPU both would wait for the same cores. ``report`` is told of each batch that is done with.
+        """
+        total, size = len(cameras.K_template), self.batch_size
+        rows = [slice(start, min(start + size, total)) for start in range(0, total, size)]
+
+        def make(chosen: slice) -> tuple[_T, slice]:
+            with self.constants():  # of the thread
+                return prepare(TemplateCameras(*(part[chosen] for part in cameras)), chosen), chosen
+
+        def reported(batches: Iterator[tuple[_T, slice]]) -> Iterator[tuple[_T, slice]]:
+            report(stage, 0, total)
+            for prepared, chosen in batches:
+                yield prepared, chosen
+                report(stage, chosen.stop, total)
+
+        with prefetch(make, rows, ahead=self.device.type != "cpu") as batches:
+            yield reported(batches)
 
     def cameras(self, mesh: Mesh) -> TemplateCameras:
-        """Cameras of all templates."""
-        rotations = self.viewpoints().to(device=self.device, dtype=torch.float32)
+        """Cameras of all templates, on the CPU, where they are rendered."""
+        rotations = self.viewpoints().to(device="cpu", dtype=torch.float32)
         return template_cameras(mesh, rotations, self.image_size, self.fill, self.distance)
 
     def render(self, mesh: Mesh, cameras: TemplateCameras) -> TemplatePictures:
@@ -199,12 +248,29 @@ class Onboarder(nn.Module):
         return PatchTable(points_model, torch.nonzero(valid)[:, 1], valid.sum(dim=1))
 
     def describe(self, levels: Tensor, patches: PatchTable) -> RawDescriptors:
-        """Describe some templates and their valid patches."""
-        features = self.extractor(dequantize(levels, self.renderer.bits))
-        template = torch.arange(len(levels), device=levels.device).repeat_interleave(patches.counts)
-        descriptors = features.patches.flatten(2).transpose(1, 2)[template, patches.patch_index].float()
+        """Describe some templates and their valid patches, on the extractor's device.
+
+        Args:
+            levels: (B, 3, S, S) pictures, on any device; those in pinned memory are fetched without waiting.
+            patches: of the pictures, on the CPU.
+        """
+        template = torch.arange(len(levels)).repeat_interleave(patches.counts)
+        template, cells = (
+            upload(pin(template, self.device), self.device),
+            upload(patches.patch_index, self.device),
+        )
+        features = self.extractor(dequantize(upload(levels, self.device), self.renderer.bits))
+        descriptors = features.patches.flatten(2).transpose(1, 2)[template, cells].float()
         cls = descriptors.new_empty(len(levels), 0) if features.cls is None else features.cls.float()
         return RawDescriptors(descriptors, cls)
+
+    def _try_batch(self, samples: int) -> None:
+        """Describe so many pictures of nothing, with all their patches."""
+        extractor, size = self.extractor, self.image_size
+        levels = torch.zeros(samples, 3, size, size, dtype=torch.uint8)
+        cells = torch.arange(extractor.grid_size(size) ** 2)
+        counts = torch.full((samples,), len(cells))
+        self.describe(levels, PatchTable(torch.empty(0, 3), cells.repeat(samples), counts))
 
     def fit(self, raw: list[Tensor], report: Progress) -> FittedWords:
         """Fit projection and words.
@@ -218,10 +284,13 @@ class Onboarder(nn.Module):
         for batch in raw:
             accumulator.update(batch.to(self.device))
         projection = copy.deepcopy(self.projection).to(self.device).fit(accumulator)
-        projected = []
+        # Filled batch by batch: joining a list would take the memory twice.
+        descriptors = projection.mean.new_empty(accumulator.count, projection.num_components)
+        filled = 0
         while raw:
-            projected.append(projection(raw.pop(0).to(self.device)))
-        descriptors = torch.cat(projected)
+            projected = projection(raw.pop(0).to(self.device))
+            descriptors[filled : filled + len(projected)] = projected
+            filled += len(projected)
         report("PCA", 1, 1)
 
         most = self.words.num_iterations
@@ -273,35 +342,11 @@ class Onboarder(nn.Module):
         idf, template_bow = describe_by_words(representation, self.bow, self.idf_mode)
         representation.idf.copy_(idf)
         representation.template_bow.copy_(template_bow)
-        # Only now: the templates' bags of words do not depend on how the descriptors are stored.
-        representation.descriptors = _stored(representation.descriptors, self.storage)
         report("bags of words", 1, 1)
-        return representation
-
-
-def describe_by_words(
-    representation: ObjectRepresentation, bow: SoftAssignBow, idf_mode: IdfMode, batch_size: int = 64
-) -> tuple[Tensor, Tensor]:
-    """Inverse document frequencies (k,) and L2-normalised bags of words (T, k) of an object's templates."""
-    words, valid = [], []
-    for index in torch.arange(representation.num_templates, device=representation.words.device).split(
-        batch_size
-    ):
-        patches = representation.gather_templates(index)
-        words.append(bow.assign(patches.descriptors, patches.valid, representation.words))
-        valid.append(patches.valid)
-    assignment = WordAssignment(*(torch.cat(parts) for parts in zip(*words, strict=True)))
-    num_words = len(representation.words)
-    idf = inverse_document_frequency(assignment, torch.cat(valid), num_words, idf_mode)
-    return idf, normalize_rows(tf_idf(word_counts(assignment, num_words), idf))
-
-
-def _stored(descriptors: Tensor, storage: Storage) -> Tensor:
-    """Descriptors in the type in which they are kept."""
-    stored = descriptors.to(_STORAGE_TYPES[storage])
-    if storage != "float32" and not bool(torch.isfinite(stored).all()):
-        raise ValueError(
-            f"descriptors of magnitude {float(descriptors.abs().max()):.3g} do not fit {storage}; "
-            "use storage=float32"
-        )
-    return stored
+        # Only now: the templates' bags of words do not depend on how the descriptors are stored.
+        if self.storage == "float32":
+            return representation
+        report("storage", 0, 1)
+        stored = representation.with_storage(self.storage, self.pq_subspaces)
+        report("storage", 1, 1)
+        return stored

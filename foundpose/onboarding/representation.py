@@ -3,7 +3,7 @@
 import json
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple, Self
 
@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from foundpose.features.base import Fingerprint, PatchExtractor
 from foundpose.features.pca import PcaProjection
 from foundpose.io import write_atomically
+from foundpose.onboarding.quantization import DescriptorCodec, Storage, codec_from_state, compress
 
 SCHEMA_VERSION = 1
 
@@ -75,6 +76,7 @@ class ObjectRepresentation(nn.Module):
         idf: (k,) inverse document frequencies.
         template_bow: (T, k) L2-normalised bags of words of the templates.
         descriptors: (M, d) projected descriptors of the valid patches of all templates; may be float16, for storage.
+            With a codec, their codes (M, n), uint8; :meth:`read_descriptors` reads either.
         points_model: (M, 3) their 3D points, mesh units.
         patch_index: (M,) int, cell ``row * grid + column`` of each patch in its template.
         template_offsets: (T + 1,) int64; template t owns patches ``offsets[t]`` to ``offsets[t + 1]``.
@@ -82,6 +84,10 @@ class ObjectRepresentation(nn.Module):
         K_template: (T, 3, 3) intrinsics of the templates.
         template_cls: (T, C') global descriptors, or None.
         info: facts that are not tensors.
+        codec: decodes the descriptors; None where they are stored as numbers.
+
+    Raises:
+        ValueError: codes without a codec, or a codec without codes.
     """
 
     words: Tensor
@@ -109,9 +115,16 @@ class ObjectRepresentation(nn.Module):
         K_template: Tensor,
         template_cls: Tensor | None,
         info: RepresentationInfo,
+        codec: DescriptorCodec | None = None,
     ) -> None:
         super().__init__()
+        if descriptors.is_floating_point() != (codec is None):
+            raise ValueError(
+                f"descriptors are {descriptors.dtype} and the codec is {codec}; descriptors that are codes need the "
+                "codec that made them, others have none"
+            )
         self.projection = projection
+        self.codec = codec
         self.register_buffer("words", words)
         self.register_buffer("idf", idf)
         self.register_buffer("template_bow", template_bow)
@@ -132,12 +145,26 @@ class ObjectRepresentation(nn.Module):
         """Number of templates T."""
         return len(self.template_offsets) - 1
 
+    def read_descriptors(self, rows: Tensor) -> Tensor:
+        """Descriptors (..., d) of patches (...), which are rows of ``descriptors``, decoded where they are codes.
+
+        They come in the type of the projection's components, whatever type they are stored in.
+
+        Differentiable w.r.t. the buffer ``descriptors``, unless it holds codes, which are constants.
+        """
+        # Rows are copied whole, several times as fast as by indexing.
+        stored = self.descriptors.index_select(0, rows.flatten())
+        if self.codec is not None:
+            stored = self.codec.decode(stored)
+        # Converted after the gather: all of them in float32 would undo what storage in less saves.
+        return stored.to(self.projection.components.dtype).reshape(*rows.shape, stored.shape[1])
+
     def gather_templates(self, index: Tensor) -> TemplatePatches:
         """Patches of templates: any shape of template indices (...) → (..., Q, ·), Q the largest template's count.
 
-        Descriptors come in the type of the projection's components, whatever type they are stored in.
+        Only the rows of these templates are read, which is all that a file mapped into memory then loads.
 
-        Differentiable w.r.t. the buffers ``descriptors`` and ``points_model``.
+        Differentiable w.r.t. the buffers ``descriptors`` (unless they are codes) and ``points_model``.
         """
         start = self.template_offsets[index]
         count = self.template_offsets[index + 1] - start
@@ -145,19 +172,56 @@ class ObjectRepresentation(nn.Module):
         valid = position < count.unsqueeze(-1)
         rows = torch.where(valid, start.unsqueeze(-1) + position, torch.zeros_like(position))
         keep = valid.unsqueeze(-1)
-        # Converted after the gather: all of them in float32 would undo what half precision saves.
-        gathered = self.descriptors[rows].to(self.projection.components.dtype)
+        gathered = self.read_descriptors(rows)
         descriptors = torch.where(keep, gathered, gathered.new_zeros(()))
-        points_model = torch.where(keep, self.points_model[rows], self.points_model.new_zeros(()))
+        points = self.points_model.index_select(0, rows.flatten()).unflatten(0, rows.shape)
+        points_model = torch.where(keep, points, points.new_zeros(()))
         cell = self.patch_index[rows].long()
         columns_rows = torch.stack([cell % self.info.grid, cell // self.info.grid], dim=-1)
         pixels = columns_rows.to(self.points_model.dtype) * self.info.stride + self.info.offset
         return TemplatePatches(descriptors, points_model, pixels, valid)
 
+    def with_storage(self, storage: Storage, subspaces: int = 64) -> Self:
+        """The same representation with its descriptors kept otherwise; the other buffers are shared.
+
+        Retrieval by bags of words does not change: those of the templates were made of the full descriptors.
+
+        Args:
+            storage: see :func:`foundpose.onboarding.quantization.compress`.
+            subspaces: bytes of a descriptor with "pq".
+
+        Raises:
+            ValueError: this one holds codes already, which are less exact than what they were made of; or as
+                :func:`~foundpose.onboarding.quantization.compress`.
+        """
+        if self.codec is not None:
+            raise ValueError(
+                f"the descriptors of {self.info.name!r} are codes ({type(self.codec).__name__}) already; convert the "
+                "representation with storage=float32"
+            )
+        descriptors, codec = compress(self.descriptors, storage, subspaces)
+        facts = {"storage": storage} | ({"pq_subspaces": subspaces} if storage == "pq" else {})
+        return type(self)(
+            self.projection,
+            self.words,
+            self.idf,
+            self.template_bow,
+            descriptors,
+            self.points_model,
+            self.patch_index,
+            self.template_offsets,
+            self.T_template_from_model,
+            self.K_template,
+            self.template_cls,
+            replace(self.info, settings=self.info.settings | facts),
+            codec,
+        )
+
     def memory_bytes(self) -> dict[str, int]:
         """Bytes taken by each part, and their ``total``.
 
-        The parts are the buffers' names (``descriptors``, ``template_bow``, ``points_model``, …) and ``projection``.
+        The parts are the buffers' names (``descriptors``, ``template_bow``, ``points_model``, …), ``projection`` and,
+        where descriptors are codes, ``codec``. Of a file that is mapped into memory, it is what can be resident.
         """
         parts: Counter[str] = Counter()
         for name, tensor in self.state_dict().items():
@@ -199,13 +263,21 @@ class ObjectRepresentation(nn.Module):
         path: str | Path,
         device: torch.device | str = "cpu",
         extractor: PatchExtractor | None = None,
+        mmap: bool = True,
     ) -> Self:
         """Read a representation.
 
+        On the CPU the buffers are the file itself, mapped into memory: loading takes a millisecond and nearly no
+        memory, the system reads pages when they are first used, shares them among processes, and may drop them when
+        memory gets scarce. Writing into a buffer changes this process's copy of a page, never the file. Files that
+        are replaced by :meth:`save`, renamed or deleted meanwhile stay readable for those that have them open, on
+        Linux and macOS; only overwriting a file in place, which :meth:`save` never does, is not allowed.
+
         Args:
             path: a file written by :meth:`save`.
-            device: where the buffers go.
+            device: where the buffers go; other devices than the CPU get copies.
             extractor: when given, the representation must have been made with an extractor like it.
+            mmap: False reads everything at once, for file systems on which reading later is slow or may fail.
 
         Raises:
             FileNotFoundError: no such file.
@@ -215,20 +287,27 @@ class ObjectRepresentation(nn.Module):
         info = read_info(path)
         with safe_open(str(path), framework="pt", device=str(device)) as file:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
-        representation = cls(
-            projection=_load_projection(tensors, path),
-            words=_take(tensors, "words", path),
-            idf=_take(tensors, "idf", path),
-            template_bow=_take(tensors, "template_bow", path),
-            descriptors=_take(tensors, "descriptors", path),
-            points_model=_take(tensors, "points_model", path),
-            patch_index=_take(tensors, "patch_index", path),
-            template_offsets=_take(tensors, "template_offsets", path),
-            T_template_from_model=_take(tensors, "T_template_from_model", path),
-            K_template=_take(tensors, "K_template", path),
-            template_cls=tensors.get("template_cls"),
-            info=info,
-        )
+        if not mmap:
+            tensors = {name: tensor.clone() for name, tensor in tensors.items()}
+        try:
+            codec = codec_from_state(_part(tensors, "codec."))
+            representation = cls(
+                projection=_load_projection(tensors),
+                words=_take(tensors, "words"),
+                idf=_take(tensors, "idf"),
+                template_bow=_take(tensors, "template_bow"),
+                descriptors=_take(tensors, "descriptors"),
+                points_model=_take(tensors, "points_model"),
+                patch_index=_take(tensors, "patch_index"),
+                template_offsets=_take(tensors, "template_offsets"),
+                T_template_from_model=_take(tensors, "T_template_from_model"),
+                K_template=_take(tensors, "K_template"),
+                template_cls=tensors.get("template_cls"),
+                info=info,
+                codec=codec,
+            )
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}; onboard the object again") from error
         if extractor is not None:
             representation.check_extractor(extractor.fingerprint())
         return representation
@@ -262,19 +341,22 @@ def read_info(path: str | Path) -> RepresentationInfo:
     return RepresentationInfo(**facts)
 
 
-def _take(tensors: Mapping[str, Tensor], name: str, path: Path) -> Tensor:
+def _take(tensors: Mapping[str, Tensor], name: str) -> Tensor:
     """A tensor of the file."""
     if name not in tensors:
-        raise ValueError(f"{path} lacks the tensor {name!r}; onboard the object again")
+        raise ValueError(f"the tensor {name!r} is missing")
     return tensors[name]
 
 
-def _load_projection(tensors: Mapping[str, Tensor], path: Path) -> PcaProjection:
+def _part(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    """State dict of a submodule."""
+    return {name.removeprefix(prefix): t for name, t in tensors.items() if name.startswith(prefix)}
+
+
+def _load_projection(tensors: Mapping[str, Tensor]) -> PcaProjection:
     """The PCA that is stored in the file."""
-    prefix = "projection."
-    components = _take(tensors, f"{prefix}components", path)
+    components = _take(tensors, "projection.components")
     projection = PcaProjection(len(components)).to(components)
-    projection.load_state_dict(
-        {name.removeprefix(prefix): t for name, t in tensors.items() if name.startswith(prefix)}
-    )
+    # Assigned, not copied: the components of many objects take memory, too.
+    projection.load_state_dict(_part(tensors, "projection."), assign=True)
     return projection

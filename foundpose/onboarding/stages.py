@@ -18,7 +18,7 @@ class TemplatePictures(NamedTuple):
     """Rendered templates.
 
     Attributes:
-        levels: (B, 3, S, S) colours as integers, see :func:`foundpose.onboarding.compression.quantize`.
+        levels: (B, 3, S, S) colours as integers; see :func:`foundpose.onboarding.compression.quantize`.
         masks: (B, S, S) bool.
     """
 

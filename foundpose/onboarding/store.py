@@ -24,13 +24,20 @@ class RepresentationStore:
         onboarder: makes what is missing.
         artefacts: keeps what the stages of onboarding made, for representations that share some of the settings;
             None keeps nothing.
+        mmap: map files into memory, so that opening one takes a millisecond and only what is used of it takes memory;
+            False reads them whole, see :meth:`ObjectRepresentation.load`.
     """
 
     def __init__(
-        self, folder: str | Path, onboarder: Onboarder, artefacts: ArtefactStore | None = None
+        self,
+        folder: str | Path,
+        onboarder: Onboarder,
+        artefacts: ArtefactStore | None = None,
+        mmap: bool = True,
     ) -> None:
         self.folder = Path(folder)
         self.onboarder = onboarder
+        self.mmap = mmap
         self._fingerprint = onboarder.extractor.fingerprint()
         self._make: Onboarder | CachedOnboarding = onboarder
         if artefacts is not None:
@@ -38,9 +45,13 @@ class RepresentationStore:
 
     def path(self, mesh: Mesh, name: str) -> Path:
         """File of an object under the onboarder's settings, whether it exists or not."""
+        return self.path_of(mesh.checksum, name)
+
+    def path_of(self, checksum: str, name: str) -> Path:
+        """As :meth:`path`, for those who know a mesh's checksum and need not load it."""
         facts = {
             "schema": SCHEMA_VERSION,
-            "mesh": mesh.checksum,
+            "mesh": checksum,
             "extractor": self._fingerprint,
             "precision": getattr(self.onboarder.extractor, "precision", None),
             "settings": self.onboarder.settings(),
@@ -56,16 +67,22 @@ class RepresentationStore:
         """Load the object's representation, or onboard the object and save it; a broken file is made again."""
         representation = load_or_make(
             self.path(mesh, name),
-            _load,
+            self._load,
             lambda path: self._make(mesh, name, progress).save(path),
         )
         representation.check_extractor(self._fingerprint)
         return representation
 
+    def find(self, checksum: str, name: str) -> ObjectRepresentation | None:
+        """Load the representation of the mesh with a checksum; None where it is missing or its file is broken."""
+        representation = self._load(self.path_of(checksum, name))
+        if representation is not None:
+            representation.check_extractor(self._fingerprint)
+        return representation
 
-def _load(path: Path) -> ObjectRepresentation | None:
-    """A representation; None where the file is missing or broken."""
-    try:
-        return ObjectRepresentation.load(path)
-    except (FileNotFoundError, ValueError):
-        return None
+    def _load(self, path: Path) -> ObjectRepresentation | None:
+        """A representation; None where the file is missing or broken."""
+        try:
+            return ObjectRepresentation.load(path, mmap=self.mmap)
+        except (FileNotFoundError, ValueError):
+            return None

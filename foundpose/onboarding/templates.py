@@ -108,7 +108,8 @@ def register_patches(
     inside = masks.to(K.dtype)[:, None]
     if erosion > 1:
         # Beyond the border counts as inside, so that only the silhouette is eroded.
-        inside = 1.0 - F.max_pool2d(1.0 - inside, erosion, stride=1, padding=erosion // 2)
+        outside = F.max_pool2d(1.0 - inside, (erosion, 1), stride=1, padding=(erosion // 2, 0))
+        inside = 1.0 - F.max_pool2d(outside, (1, erosion), stride=1, padding=(0, erosion // 2))
     side = masks.shape[-1]
     centres = (torch.arange(grid, device=K.device, dtype=K.dtype) * stride + offset) * (2 / side) + (
         1 / side - 1

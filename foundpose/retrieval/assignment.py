@@ -11,15 +11,6 @@ _GPU_SCORES_PER_BLOCK = 1 << 26
 _GROUP = 64
 
 
-def has_fast_bfloat16(device: torch.device) -> bool:
-    """Whether a CPU multiplies bfloat16 matrices in hardware (GPUs are fast enough without)."""
-    return (
-        device.type == "cpu"
-        and torch.backends.mkldnn.is_available()
-        and torch.cpu._is_avx512_bf16_supported()
-    )
-
-
 def find_nearest(
     points: Tensor, squared_norms: Tensor, centroids: Tensor, with_second: bool = False
 ) -> tuple[Tensor, Tensor, Tensor | None]:

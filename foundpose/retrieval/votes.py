@@ -1,5 +1,8 @@
 """Retrieval by direct matching of patches: every patch of the crop is compared with every patch of all templates."""
 
+from collections.abc import Callable
+from typing import Protocol, runtime_checkable
+
 import torch
 from torch import Tensor
 
@@ -13,6 +16,15 @@ from foundpose.retrieval.base import (
 )
 
 _TEMPLATES_PER_BLOCK = 16
+
+
+@runtime_checkable
+class ReadsDescriptors(Protocol):
+    """A template index that may keep descriptors as codes, such as an object representation."""
+
+    def read_descriptors(self, rows: Tensor) -> Tensor:
+        """Descriptors (..., d) of patches (...)."""
+        ...
 
 
 class PatchVoteRetriever(Retriever):
@@ -49,15 +61,16 @@ class PatchVoteRetriever(Retriever):
         Raises:
             ValueError: If the shapes of query and index do not fit.
 
-        Differentiable w.r.t. ``query.descriptors`` and ``index.descriptors`` through ``similarity``; the choice of
-        templates is constant, and so is which patches are most similar.
+        Differentiable w.r.t. ``query.descriptors`` and ``index.descriptors`` (unless they are codes) through
+        ``similarity``; the choice of templates is constant, and so is which patches are most similar.
         """
         _check(query, index)
         x = query.descriptors.masked_fill(~query.valid.unsqueeze(-1), 0.0)
+        read = _reader(index)
         similarity = template_similarities(
             x.detach(),
             query.valid,
-            index.descriptors.detach(),
+            lambda rows: read(rows).detach(),
             index.template_offsets,
             self.chunk,
         )
@@ -77,14 +90,19 @@ class PatchVoteRetriever(Retriever):
 
 
 def template_similarities(
-    descriptors: Tensor, valid: Tensor, template_descriptors: Tensor, template_offsets: Tensor, chunk: int
+    descriptors: Tensor,
+    valid: Tensor,
+    template_descriptors: Tensor | Callable[[Tensor], Tensor],
+    template_offsets: Tensor,
+    chunk: int,
 ) -> Tensor:
     """Mean best cosine similarity of each crop's valid patches to the patches of each template.
 
     Args:
         descriptors: (B, P, d) of the crops, finite.
         valid: (B, P) bool.
-        template_descriptors: (M, d) of all templates, one template after another.
+        template_descriptors: (M, d) of all templates, one template after another; or what returns rows of them, as
+            codes are decoded block by block.
         template_offsets: (T + 1,) int64; template t owns patches ``offsets[t]`` to ``offsets[t + 1]``.
         chunk: number of similarities that exist at a time.
 
@@ -94,6 +112,9 @@ def template_similarities(
     rows = torch.nonzero(valid.flatten()).squeeze(1)
     x = normalize_rows(descriptors.flatten(0, 1)[rows])
     count = template_offsets.diff()
+    read = (
+        template_descriptors.__getitem__ if isinstance(template_descriptors, Tensor) else template_descriptors
+    )
     # Templates of about the same size stand together, so that padding them to the largest costs little.
     order = count.argsort(stable=True)
     best = x.new_full((len(x), len(count)), -torch.inf)
@@ -103,7 +124,7 @@ def template_similarities(
         most = sizes[min(first + _TEMPLATES_PER_BLOCK, len(sizes)) - 1]
         if most == 0:
             continue
-        patches = _patches_of(block, most, template_descriptors, template_offsets, x.dtype)
+        patches = _patches_of(block, most, read, template_offsets, x.dtype)
         flat = patches.flatten(0, 1).T
         step = max(1, chunk // flat.shape[1])
         for start in range(0, len(x), step):
@@ -118,13 +139,18 @@ def template_similarities(
 
 def _similarity_of(templates: Tensor, x: Tensor, valid: Tensor, index: TemplateIndex) -> Tensor:
     """Similarities (B, h) of crops (B, P, d) to a few templates (B, h) of each, with a graph."""
-    patches = _patches_of(templates, index.max_patches, index.descriptors, index.template_offsets, x.dtype)
+    patches = _patches_of(templates, index.max_patches, _reader(index), index.template_offsets, x.dtype)
     best = torch.einsum("bpd,bhqd->bhpq", normalize_rows(x), patches).amax(dim=3)
     return (best * valid.unsqueeze(1)).sum(dim=2) / valid.sum(dim=1, keepdim=True).clamp(min=1)
 
 
+def _reader(index: TemplateIndex) -> Callable[[Tensor], Tensor]:
+    """What returns rows of an object's descriptors."""
+    return index.read_descriptors if isinstance(index, ReadsDescriptors) else index.descriptors.__getitem__
+
+
 def _patches_of(
-    templates: Tensor, most: int, descriptors: Tensor, offsets: Tensor, dtype: torch.dtype
+    templates: Tensor, most: int, read: Callable[[Tensor], Tensor], offsets: Tensor, dtype: torch.dtype
 ) -> Tensor:
     """Normalised patches (..., most, d) of templates (...); the last of a template repeats, which no maximum sees.
 
@@ -133,7 +159,7 @@ def _patches_of(
     start, count = offsets[templates], offsets.diff()[templates]
     position = torch.arange(most, device=offsets.device)
     rows = start.unsqueeze(-1) + torch.minimum(position, (count - 1).clamp(min=0).unsqueeze(-1))
-    return normalize_rows(descriptors[rows.clamp(max=len(descriptors) - 1)].to(dtype))
+    return normalize_rows(read(torch.minimum(rows, offsets[-1] - 1)).to(dtype))
 
 
 def _check(query: QueryPatches, index: TemplateIndex) -> None:
@@ -143,7 +169,7 @@ def _check(query: QueryPatches, index: TemplateIndex) -> None:
             f"{tuple(query.descriptors.shape)} and {tuple(query.valid.shape)}"
         )
     width = query.descriptors.shape[2]
-    if index.descriptors.ndim != 2 or index.descriptors.shape[1] != width:
-        raise ValueError(
-            f"the object's descriptors must have shape (M, {width}), got {tuple(index.descriptors.shape)}"
-        )
+    # Codes have a length of their own; words are as long as what they decode to.
+    stored = index.descriptors if index.descriptors.is_floating_point() else index.words
+    if stored.ndim != 2 or stored.shape[1] != width:
+        raise ValueError(f"the object's descriptors must have shape (M, {width}), got {tuple(stored.shape)}")

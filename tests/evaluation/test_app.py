@@ -108,6 +108,20 @@ def test_two_processes_share_the_work(arguments, reference, tmp_path):
     assert scores[0]["mspd"] == scores[1]["mspd"]
 
 
+def test_processes_agree_on_a_size_that_is_found_out(arguments, reference, tmp_path):
+    run = start([*arguments, "data_module.batch_size=auto", "trainer=ddp", "trainer.devices=2"], tmp_path)
+    assert run.returncode == 0, run.stderr[-2000:]
+    size = json.loads((tmp_path / "batch_size.json").read_text())["batch_size"]
+    assert size in (1, 2)  # every process gets a batch
+    numbers = [
+        [json.loads(line)["number"] for line in shard_path(tmp_path, rank).read_text().splitlines()]
+        for rank in range(2)
+    ]
+    batches = list(range(NUM_IMAGES // size))
+    assert numbers == [batches[::2], batches[1::2]]
+    assert rows_without_times(tmp_path / NAME) == rows_without_times(reference / NAME)
+
+
 def test_a_killed_run_goes_on(arguments, reference, root, tmp_path):
     """Kill it as soon as batches are there, twice; the end is that of the run left alone."""
     shard = shard_path(tmp_path, 0)

@@ -6,6 +6,8 @@ import pytorch_lightning as pl
 import torch
 from PIL import Image
 
+import foundpose.batch_size
+import foundpose.timing
 from foundpose.bop import BopDataset, detected_instances, ground_truth_instances
 from foundpose.evaluation import (
     PoseDataModule,
@@ -221,3 +223,78 @@ def test_workers_read_the_same_batches(root, store, tmp_path):
     ]
     assert json.dumps(records[0]) == json.dumps(records[1])
     assert again.batches == data.batches
+
+
+def test_the_size_is_kept_in_the_folder_and_taken_from_there(root, store, tmp_path, monkeypatch):
+    tried = []
+    monkeypatch.setattr(foundpose.batch_size, "free_memory", lambda device: 10**12)
+    estimate = PoseEvaluation.estimate
+
+    def counted(self, batch, waiting=0.0):
+        tried.append(len(batch.instances))
+        return estimate(self, batch, waiting)
+
+    monkeypatch.setattr(PoseEvaluation, "estimate", counted)
+    data, _, done = run(root, store, tmp_path, masks=ground_truth_instances, batch_size="auto")
+    assert tried[:3] == [1, 1, 2]
+    assert json.loads((tmp_path / "batch_size.json").read_text()) == {"batch_size": 4}
+    assert [len(batch) for batch in data.batches] == [4, 1]
+    _, _, fixed = run(root, store, tmp_path / "b", masks=ground_truth_instances, batch_size=4)
+    assert [without_times(r) for r in all_records(done)] == [without_times(r) for r in all_records(fixed)]
+
+    # A run that goes on there has the same batches, however much memory there is now.
+    (tmp_path / "batch_size.json").write_text('{"batch_size": 2}')
+    (tmp_path / "shards" / "rank-00000.jsonl").unlink()
+    tried.clear()
+    monkeypatch.setattr(foundpose.batch_size, "free_memory", lambda device: 0)
+    data, _, _ = run(root, store, tmp_path, masks=ground_truth_instances, batch_size="auto")
+    assert tried == [2, 2, 1]
+    assert [len(batch) for batch in data.batches] == [2, 2, 1]
+
+
+def test_a_size_that_is_not_known_yet(root, store, tmp_path):
+    dataset = BopDataset(root)
+    objects = DatasetObjects(dataset, store)
+    data = PoseDataModule(dataset, ground_truth_instances, objects, tmp_path, batch_size="auto")
+    with pytest.raises(
+        RuntimeError, match=r"found out when a run starts, and .*batch_size.json is not there"
+    ):
+        _ = data.batches
+    with pytest.raises(RuntimeError, match=r"needs trainer.predict"):
+        data.prepare_data()
+    for damaged in ("{}", "[", '{"batch_size": 0}', '{"batch_size": "3"}'):
+        (tmp_path / "batch_size.json").write_text(damaged)
+        with pytest.raises(ValueError, match=r"batch_size.json is damaged .* delete it"):
+            _ = data.batches
+    with pytest.raises(ValueError, match="order must be one of"):
+        PoseDataModule(dataset, ground_truth_instances, objects, tmp_path, order="size")
+
+
+def test_no_clock_waits_unless_stages_are_timed(root, store, tmp_path, monkeypatch):
+    """On a machine with a GPU the only waits are those for results."""
+    waits = []
+    monkeypatch.setattr(foundpose.timing.torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(foundpose.timing.torch.cuda, "synchronize", lambda *_: waits.append(1))
+    dataset = BopDataset(root)
+    objects = DatasetObjects(dataset, store)
+    for time_stages in (True, False):
+        folder = tmp_path / str(time_stages)
+        data = PoseDataModule(dataset, ground_truth_instances, objects, folder, TrueCoordinates(), 3)
+        module = PoseEvaluation(make_pipeline(), objects, folder, time_stages)
+        waits.clear()
+        module_trainer = trainer()
+        estimate_dataset(module_trainer, module, data)
+        assert bool(waits) == time_stages
+        record = json.loads((folder / "shards" / "rank-00000.jsonl").read_text().splitlines()[0])
+        assert ("pnp" in record["seconds"]) == time_stages
+        assert record["seconds"]["pipeline"] == pytest.approx(sum(r["seconds"] for r in record["records"]))
+        assert record["seconds"]["pipeline"] > 0
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_auto_on_a_gpu(root, store, tmp_path):
+    dataset = BopDataset(root)
+    objects = DatasetObjects(dataset, store)
+    data = PoseDataModule(dataset, ground_truth_instances, objects, tmp_path, TrueCoordinates(), "auto")
+    estimate_dataset(trainer(accelerator="gpu"), PoseEvaluation(make_pipeline(), objects, tmp_path), data)
+    assert json.loads((tmp_path / "batch_size.json").read_text())["batch_size"] == 4

@@ -108,8 +108,10 @@ def test_poses_barely_move(oracle_blob, half, blob, refined):
 
 
 def test_bad_storage(blob):
-    with pytest.raises(ValueError, match=r"storage must be one of \('float32', 'float16'\), got 'int8'"):
-        make_onboarder(storage="int8")
+    with pytest.raises(
+        ValueError, match=r"storage must be one of \('float32', 'float16', 'int8', 'pq'\), got 'int4'"
+    ):
+        make_onboarder(storage="int4")
     loud = make_onboarder(extractor=CoordinateCode(norm=1e6), storage="float16")
     with pytest.raises(ValueError, match="do not fit float16; use storage=float32"):
         loud(blob, "blob")

@@ -152,10 +152,11 @@ def test_neighbourhoods_hold_all_points_and_search_what_is_near() -> None:
     index, cost, second = near.find_nearest(moved, with_second=True)
     expected = exact_costs(near.points, moved).topk(2, dim=1, largest=False)
     right = index == expected.indices[:, 0]
-    assert right.double().mean() > 0.999
+    assert right.double().mean() > 0.99
     torch.testing.assert_close(cost[right], expected.values[right, 0])
     assert (second >= cost).all()
-    assert torch.isclose(second, expected.values[:, 1]).double().mean() > 0.99
+    assert torch.isclose(second, expected.values[:, 1]).double().mean() > 0.9
+    assert (cost / expected.values[:, 0]).mean() < 1.001
     torch.testing.assert_close(cost, (near.points - moved[index]).square().sum(1))
 
 

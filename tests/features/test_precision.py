@@ -1,0 +1,108 @@
+from pathlib import Path
+
+import pytest
+import torch
+
+import foundpose.features.precision as precision_module
+from foundpose.features import AdaptedExtractor, PatchNoise
+from foundpose.features.precision import (
+    autocast_dtype,
+    autocast_precision,
+    cpu_instructions,
+    has_fast_bfloat16,
+)
+from tests.features.test_dinov2 import tiny
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture
+def images(generator) -> torch.Tensor:
+    return torch.rand(3, 3, 56, 56, generator=generator)
+
+
+@pytest.fixture(params=[True, False], ids=["with bf16", "without bf16"])
+def fast(request, monkeypatch) -> bool:
+    """Whether the CPU is taken to have bfloat16 instructions."""
+    instructions = {"avx2", "avx512_bf16"} if request.param else {"avx2"}
+    monkeypatch.setattr(precision_module, "cpu_instructions", lambda: instructions)
+    monkeypatch.setattr(torch.backends.mkldnn, "is_available", lambda: True)
+    return request.param
+
+
+def test_auto_is_what_the_cpu_has_instructions_for(images, fast) -> None:
+    exact, rounded, auto = tiny(), tiny(precision="bf16"), tiny(precision="auto")
+    with torch.no_grad():
+        expected = (rounded if fast else exact)(images)
+        found = auto(images)
+    assert torch.equal(found.patches, expected.patches)
+    assert torch.equal(found.cls, expected.cls)
+    assert found.patches.dtype == torch.float32
+    assert auto.running_precision() == ("bf16" if fast else None)
+    assert auto.fingerprint() == exact.fingerprint()
+
+
+def test_auto_leaves_gradients_exact(images, fast) -> None:
+    exact, auto = tiny(), tiny(precision="auto")
+    gradients = []
+    for extractor in (exact, auto):
+        x = images.clone().requires_grad_(True)
+        out = extractor(x).patches
+        (gradient,) = torch.autograd.grad(out.square().sum(), x)
+        gradients.append((out.detach(), gradient))
+    assert torch.equal(gradients[0][0], gradients[1][0])
+    assert torch.equal(gradients[0][1], gradients[1][1])
+
+
+def test_what_was_asked_for_is_what_runs(monkeypatch) -> None:
+    for name, dtype in (("bf16", torch.bfloat16), ("fp16", torch.float16)):
+        assert autocast_dtype(name, CPU) == dtype
+        assert autocast_precision(name, CPU) == name
+    assert autocast_dtype(None, CPU) is None
+    with torch.no_grad():
+        assert autocast_dtype("auto", torch.device("meta")) is None
+    for capability, expected in (((6, 1), None), ((7, 5), "fp16"), ((8, 0), "bf16"), ((9, 0), "bf16")):
+        monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device, c=capability: c)
+        assert autocast_precision("auto", torch.device("cuda")) == expected
+
+
+def test_extractors_around_another_run_in_its_precision() -> None:
+    inner = tiny(precision="bf16")
+    assert AdaptedExtractor(inner).running_precision() == "bf16"
+    assert PatchNoise(inner, 0.5).running_precision() == "bf16"
+    assert AdaptedExtractor(tiny()).running_precision() is None
+
+
+def test_instructions_are_the_same_from_torch_and_from_linux(monkeypatch, tmp_path) -> None:
+    if not Path("/proc/cpuinfo").is_file():
+        pytest.skip("needs Linux")
+    by_torch = cpu_instructions()
+    monkeypatch.setattr(torch.cpu, "get_capabilities", None, raising=False)
+    by_linux = cpu_instructions()
+    assert by_linux
+    if hasattr(torch.cpu, "get_capabilities"):
+        for name in ("avx2", "avx512_bf16", "amx_bf16"):
+            assert (name in by_torch) == (name in by_linux)
+    monkeypatch.setattr(precision_module, "_CPUINFO", tmp_path / "none")
+    assert cpu_instructions() == set()
+    assert not has_fast_bfloat16(CPU)
+    for text, expected in (
+        ("processor\t: 0\nflags\t\t: fpu avx512_bf16 sse\nbugs\t\t:\n", True),
+        ("processor\t: 0\nflags\t\t: fpu avx2\n", False),
+        ("processor\t: 0\nFeatures\t: bf16\n", False),
+    ):
+        (tmp_path / "cpuinfo").write_text(text)
+        monkeypatch.setattr(precision_module, "_CPUINFO", tmp_path / "cpuinfo")
+        assert has_fast_bfloat16(CPU) == (expected and torch.backends.mkldnn.is_available())
+    assert not has_fast_bfloat16(torch.device("meta"))
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_auto_on_a_gpu(images) -> None:
+    exact, auto = tiny().cuda(), tiny(precision="auto").cuda()
+    with torch.no_grad():
+        found, expected = auto(images.cuda()), exact(images.cuda())
+    assert auto.running_precision() in ("bf16", "fp16")
+    assert not torch.equal(found.patches, expected.patches)
+    similarity = torch.nn.functional.cosine_similarity(found.patches, expected.patches, dim=1)
+    assert similarity.min() > 0.999
