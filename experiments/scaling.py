@@ -7,6 +7,7 @@ python experiments/scaling.py
 python experiments/scaling.py counts=[10,100] storages=[int8,pq64]
 """
 
+import ctypes
 import gc
 import os
 import shutil
@@ -68,9 +69,10 @@ class Row:
     first: float
     again: float
 
-    def at(self, objects: int) -> "Row":
-        """In proportion, for another number of objects; the crops are as many, and each takes as long."""
+    def at(self, objects: int, crops: int) -> "Row":
+        """For another number of objects, in proportion; the crops are as many, and each takes as long."""
         ratio = objects / self.objects
+        used = expected_distinct(objects, crops) / expected_distinct(self.objects, crops)
         return replace(
             self,
             objects=objects,
@@ -78,8 +80,13 @@ class Row:
             disk=ratio * self.disk,
             open_seconds=ratio * self.open_seconds,
             resident_open=ratio * self.resident_open,
-            resident_used=ratio * self.resident_open + self.resident_used - self.resident_open,
+            resident_used=ratio * self.resident_open + used * (self.resident_used - self.resident_open),
         )
+
+
+def expected_distinct(objects: int, crops: int) -> float:
+    """How many objects random crops hit on average, each at least once."""
+    return objects * (1.0 - (1.0 - 1.0 / objects) ** crops)
 
 
 class Crops:
@@ -151,7 +158,7 @@ def measure(cfg: DictConfig, files: Path) -> list[Row]:
                 measure_objects(name, paths[:count], crops, cfg.crops)
                 for count in tqdm(fitting, desc=f"{name}: numbers of objects")
             ]
-        rows += measured + [measured[-1].at(count) for count in counts if count not in fitting]
+        rows += measured + [measured[-1].at(count, cfg.crops) for count in counts if count not in fitting]
     return rows
 
 
@@ -197,7 +204,7 @@ def distinct_files(
 def measure_objects(name: str, paths: Sequence[Path], crops: Crops, count: int) -> Row:
     """Open files and estimate poses of crops of random objects among them, twice."""
     forget(paths)
-    gc.collect()
+    return_free_memory()
     before = resident()
     start = time.perf_counter()
     objects = [ObjectRepresentation.load(path) for path in paths]
@@ -217,6 +224,14 @@ def measure_objects(name: str, paths: Sequence[Path], crops: Crops, count: int) 
         first=statistics.median(first),
         again=statistics.median(passes[1]),
     )
+
+
+def return_free_memory() -> None:
+    """Give memory that is not used any more back to the system now, not while something is measured."""
+    gc.collect()
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc's
+    if trim is not None:
+        trim(0)
 
 
 def forget(paths: Sequence[Path]) -> None:

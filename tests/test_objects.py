@@ -1,5 +1,7 @@
 """Many objects at once: lazily loaded, mapped into memory, bounded."""
 
+import ctypes
+import gc
 import json
 import os
 import shutil
@@ -58,6 +60,9 @@ def loads(monkeypatch) -> list[str]:
 
 def resident() -> float:
     """MiB of this process that are in memory."""
+    # What earlier tests have freed would be used again, or given back in the middle of a measurement.
+    gc.collect()
+    ctypes.CDLL(None).malloc_trim(0)
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith("VmRSS:"):
             return int(line.split()[1]) / 1024

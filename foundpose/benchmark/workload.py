@@ -120,6 +120,7 @@ def subset(representation: ObjectRepresentation, templates: int) -> ObjectRepres
         representation.K_template[:templates],
         None,
         representation.info,
+        representation.codec,
     )
 
 

@@ -53,7 +53,7 @@ class RepresentationStore:
             "schema": SCHEMA_VERSION,
             "mesh": checksum,
             "extractor": self._fingerprint,
-            "precision": getattr(self.onboarder.extractor, "precision", None),
+            "precision": self.onboarder.extractor.running_precision(),
             "settings": self.onboarder.settings(),
         }
         digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
