@@ -43,6 +43,9 @@ _STATUS = Path("/proc/self/status")
 _CROPS_PREPARED = 8
 
 
+_RECORDED = ("counts", "crops", "sizes")
+
+
 @dataclass(frozen=True)
 class Row:
     """What ``objects`` objects cost.
@@ -122,7 +125,7 @@ def main(cfg: DictConfig) -> None:
     with clear_errors():
         rows = measure(cfg, folder / "objects" if cfg.files is None else Path(cfg.files))
         content = {
-            "settings": {k: OmegaConf.to_container(cfg)[k] for k in ("counts", "crops", "sizes")},  # type: ignore[index, call-overload]
+            "settings": {k: OmegaConf.to_object(cfg[k]) if k != "crops" else cfg.crops for k in _RECORDED},
             "hardware": describe_hardware(torch.device("cpu")),
             "versions": describe_versions(),
             "rows": [asdict(row) for row in rows],
