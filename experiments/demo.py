@@ -1,6 +1,7 @@
-"""Onboard a procedural object, find its pose in a cluttered picture, and show the result.
+"""Onboard an object, find its pose in a picture, say whether it is right, and show the result.
 
-python experiments/demo.py            # another object and picture: seed=1
+python experiments/demo.py                                         # a watering can in a photograph
+python experiments/demo.py scene=procedural extractor=dense_sift   # offline; another object and picture: seed=1
 """
 
 import sys
@@ -9,42 +10,49 @@ from pathlib import Path
 import hydra
 import torch
 from hydra.core.hydra_config import HydraConfig
+from hydra.utils import instantiate
 from omegaconf import DictConfig
+from torch import Tensor
 
-from foundpose.config import build_method, clear_errors
+from foundpose.config import Method, build_method, clear_errors
+from foundpose.estimates import PoseEstimates
 from foundpose.geometry import rotation_angle
+from foundpose.onboarding import ObjectRepresentation
 from foundpose.progress import ProgressBars
-from foundpose.synthetic import cluttered_scene, procedural_mesh
+from foundpose.scenes import KnownScene
 from foundpose.visualization import save_estimate_figure
-
-# A right pose lies within these of the truth: about half a template's distance from its neighbours, coarse as it is.
-MAX_ROTATION_DEGREES = 10.0
-MAX_TRANSLATION_DIAMETERS = 0.1
 
 
 @hydra.main(version_base="1.3", config_path="../conf", config_name="demo")
 def main(cfg: DictConfig) -> None:
     """Run the demo; the exit status is 1 when the pose is wrong."""
+    settings = HydraConfig.get()
     with clear_errors():
-        right = run(cfg, Path(HydraConfig.get().runtime.output_dir))
+        right = run(cfg, Path(settings.runtime.output_dir), settings.runtime.choices["extractor"])
     if not right:
         sys.exit(1)
 
 
-def run(cfg: DictConfig, output: Path) -> bool:
+def run(cfg: DictConfig, output: Path, extractor: str) -> bool:
     """Run the demo and say whether the pose is right."""
+    scene: KnownScene = instantiate(cfg.scene)
+    fetches = cfg.extractor.get("weights", "random") != "random"
+    say(
+        f"1/4 loading the extractor {extractor}"
+        + (" (weights that are not here yet are downloaded)" if fetches else "")
+    )
     method = build_method(cfg)
-    mesh = procedural_mesh(cfg.seed)
-    scene = cluttered_scene(mesh, cfg.seed)
-    representation = method.store.get(mesh, f"demo-{cfg.seed}", ProgressBars("onboarding"))
+    representation = onboard(method, scene)
+    say("3/4 estimating the pose in the picture: crop, retrieval, matching, PnP, refinement")
     with torch.no_grad():
         estimates = method.pipeline(
             scene.image[None].to(cfg.device),
             scene.K[None].to(cfg.device),
             representation.to(cfg.device),
             masks=scene.mask[None].to(cfg.device),
-            meshes=mesh,
+            meshes=scene.mesh,
         )
+    say("4/4 drawing the figure")
     save_estimate_figure(
         output / "overlay.png",
         scene.image,
@@ -52,24 +60,55 @@ def run(cfg: DictConfig, output: Path) -> bool:
         estimates,
         0,
         representation,
-        mesh,
+        scene.mesh,
         method.onboarder.renderer,
         scene.T_camera_from_model,
     )
-    T = estimates.T_camera_from_model[0].cpu()
-    rotation = float(torch.rad2deg(rotation_angle(T[:3, :3], scene.T_camera_from_model[:3, :3])))
-    translation = float((T[:3, 3] - scene.T_camera_from_model[:3, 3]).norm())
+    return judge(cfg, scene, estimates, output / "overlay.png")
+
+
+def onboard(method: Method, scene: KnownScene) -> ObjectRepresentation:
+    """The object's representation, from the store or made now."""
+    if method.store.has(scene.mesh, scene.name):
+        say(f"2/4 {scene.name} was onboarded before: {method.store.path(scene.mesh, scene.name)}")
+    else:
+        say(
+            f"2/4 onboarding {scene.name}: rendering it from all sides and describing these templates, "
+            f"once; kept in {method.store.folder}"
+        )
+    return method.store.get(scene.mesh, scene.name, ProgressBars("onboarding"))
+
+
+def judge(cfg: DictConfig, scene: KnownScene, estimates: PoseEstimates, figure: Path) -> bool:
+    """Print how far the pose is from the truth and whether that is right."""
+    rotation, translation = errors(estimates.T_camera_from_model[0], scene)
+    diameter = float(scene.mesh.diameter)
     right = (
         bool(estimates.valid[0])
-        and rotation < MAX_ROTATION_DEGREES
-        and translation < MAX_TRANSLATION_DIAMETERS * mesh.diameter
+        and rotation < cfg.max_rotation
+        and translation < cfg.max_translation * diameter
     )
     print(f"inliers: {int(estimates.num_inliers[0])} of {int(estimates.query.valid[0].sum())} patches")
+    if estimates.refined is not None:
+        before = errors(estimates.T_coarse[0], scene)
+        print(f"before refinement: {before[0]:.2f} degrees, {before[1]:.2f} mm")
     print(f"rotation error: {rotation:.2f} degrees")
-    print(f"translation error: {translation:.2f} mm of {float(mesh.diameter):.0f} mm diameter")
-    print(f"overlay: {output / 'overlay.png'}")
+    print(f"translation error: {translation:.2f} mm of {diameter:.0f} mm diameter")
+    print(f"overlay: {figure} (contours: truth red, before refinement blue, result green)")
     print("pose: right" if right else "pose: WRONG")
     return right
+
+
+def errors(T_camera_from_model: Tensor, scene: KnownScene) -> tuple[float, float]:
+    """Rotation error in degrees and translation error in the mesh's unit."""
+    T, truth = T_camera_from_model.cpu(), scene.T_camera_from_model
+    rotation = float(torch.rad2deg(rotation_angle(T[:3, :3], truth[:3, :3])))
+    return rotation, float((T[:3, 3] - truth[:3, 3]).norm())
+
+
+def say(step: str) -> None:
+    """Print a step at once, also where the output is a pipe."""
+    print(step, flush=True)
 
 
 if __name__ == "__main__":

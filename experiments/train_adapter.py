@@ -44,7 +44,15 @@ MAY_CHANGE = ("device", "representations", "trainer")
 TRAINING_OBJECTS, VALIDATION_OBJECTS, HELD_OUT_SCENES = 1000, 2000, 10_000
 MODES = ("retrieved", "nearest")
 # What an option of the config group extractor sets.
-EXTRACTOR_SETTINGS = ("extractor", "sigma", "temperature", "residual", "residual_scale")
+EXTRACTOR_SETTINGS = (
+    "extractor",
+    "sigma",
+    "temperature",
+    "residual",
+    "residual_scale",
+    "auto_scale",
+    "background",
+)
 
 
 @hydra.main(version_base="1.3", config_path="../conf", config_name="train_adapter")

@@ -6,16 +6,18 @@ from foundpose.geometry import PerspectiveCrop, SphereInplane, SuperFibonacci
 from foundpose.matching import PatchMatcher, SoftPatchMatcher
 from foundpose.onboarding import ObjectRepresentation, Onboarder, RepresentationStore
 from foundpose.pipeline import FoundPose
-from foundpose.pnp import GaussNewtonPnp, RansacPnp, SoftInlierSelection, TopTemplatePose
+from foundpose.pnp import GaussNewtonPnp, RansacPnp, SoftInlierSelection, TemplateStart, TopTemplatePose
 from foundpose.refinement import FeaturemetricRefiner, PoseRefiner, RefinerChain, RenderAndCompareRefiner
 from foundpose.rendering import Mesh, PyrenderRenderer, RaycastRenderer, load_mesh
 from foundpose.retrieval import (
     ClsRetriever,
     PatchVoteRetriever,
     SoftAssignBow,
+    SpatialReranker,
     TemplateRetriever,
     VisualWords,
 )
+from foundpose.verification import InlierScore, PatchVerification
 
 __version__ = "0.1.0"
 
@@ -27,11 +29,13 @@ __all__ = [
     "FeaturemetricRefiner",
     "FoundPose",
     "GaussNewtonPnp",
+    "InlierScore",
     "Mesh",
     "ObjectRepresentation",
     "Onboarder",
     "PatchExtractor",
     "PatchMatcher",
+    "PatchVerification",
     "PatchVoteRetriever",
     "PcaProjection",
     "PerspectiveCrop",
@@ -47,9 +51,11 @@ __all__ = [
     "SoftAssignBow",
     "SoftInlierSelection",
     "SoftPatchMatcher",
+    "SpatialReranker",
     "SphereInplane",
     "SuperFibonacci",
     "TemplateRetriever",
+    "TemplateStart",
     "TopTemplatePose",
     "VisualWords",
     "load_mesh",

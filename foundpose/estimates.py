@@ -37,6 +37,7 @@ class Correspondences(NamedTuple):
         distance: (B, h, P) descriptor distances, +inf where not valid.
         weight: (B, h, P) confidences in (0, 1], 0 where not valid.
         valid: (B, h, P) bool.
+        priority: (B, h, P) order in which matches are trusted, −inf where not valid.
     """
 
     points_image: Tensor
@@ -45,6 +46,7 @@ class Correspondences(NamedTuple):
     distance: Tensor
     weight: Tensor
     valid: Tensor
+    priority: Tensor
 
 
 class PoseHypotheses(NamedTuple):
@@ -55,8 +57,9 @@ class PoseHypotheses(NamedTuple):
         inliers: (B, h, P) bool.
         num_inliers: (B, h); 0 without correspondences.
         status: (B, h) codes of :class:`PoseStatus`.
-        score: (B, h) the share of the crop's patches that are inliers; for poses of templates the similarity of the
-            template. The larger the better; means nothing where the status is not OK.
+        score: (B, h) by the pipeline's scorer (:class:`foundpose.verification.InlierScore`: the share of the crop's
+            patches that are inliers); for poses of templates the similarity of the template. The larger the better;
+            means nothing where the status is not OK.
     """
 
     T_crop_from_model: Tensor
@@ -71,12 +74,10 @@ class PoseEstimates(NamedTuple):
 
     Attributes:
         T_camera_from_model: (B, 4, 4), mesh units; finite but meaningless where not valid.
-        score: (B,) confidence: the share of the crop's patches that are inliers, in [0, 1], or for poses of templates
-            the similarity of the template, at most 1; with a refiner the refiner's score (0 for a pose that could not
-            be refined and is returned as it was).
-        num_inliers: (B,) inlier correspondences of the chosen hypothesis, the quality by which the best of h is
-            chosen (with a refiner of several: chosen by its score). For poses of templates it is 0, and the most
-            similar template is chosen.
+        score: (B,) confidence in [0, 1] by the pipeline's scorer, or for poses of templates the similarity of the
+            template, at most 1. With a refiner it is that of the refined pose, or the refiner's own score where the
+            scorer looks at inliers only (0 for a pose that could not be refined and is returned as it was).
+        num_inliers: (B,) inlier correspondences of the chosen hypothesis; 0 for poses of templates.
         valid: (B,) bool, a pose with at least the fewest inliers that the PnP stage asks for. It is no confidence:
             noise can reach that many by chance. Judge by ``score``.
         status: (B,) codes of :class:`PoseStatus`.
@@ -120,6 +121,7 @@ def no_correspondences(query: QueryPatches, templates: RetrievedTemplates) -> Co
         distance=nothing,
         weight=nothing,
         valid=nothing.bool(),
+        priority=nothing,
     )
 
 

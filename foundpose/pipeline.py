@@ -1,7 +1,7 @@
 """The composed method: from images and masks to poses."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import cast, get_args
 
 import torch
@@ -22,12 +22,26 @@ from foundpose.geometry import Crops, PerspectiveCrop, invert_transform
 from foundpose.grouping import combine, crops_of_objects, object_of_each_crop, take_rows
 from foundpose.matching import PatchMatcher, SoftPatchMatcher
 from foundpose.onboarding import ObjectRepresentation, RepresentationInfo
-from foundpose.pnp import PoseCandidates, RansacPnp, TemplatePoses, TopTemplatePose
+from foundpose.pnp import (
+    PnpResult,
+    PoseCandidates,
+    RansacPnp,
+    TemplatePoses,
+    TemplateStart,
+    TopTemplatePose,
+)
 from foundpose.pnp.soft_selection import choose_softly
 from foundpose.refinement import PoseProposals, PoseRefiner
 from foundpose.rendering import Mesh
 from foundpose.retrieval import QueryPatches, RetrievedTemplates, Retriever
-from foundpose.selection import RefineWhat, choose_coarse, choose_refined, hypotheses_to_refine
+from foundpose.selection import (
+    RefineWhat,
+    better_of_two,
+    choose_coarse,
+    choose_refined,
+    hypotheses_to_refine,
+)
+from foundpose.verification import HypothesisScorer, InlierScore
 
 
 class _ExtractorChecks:
@@ -68,8 +82,13 @@ class FoundPose(nn.Module):
             of the templates themselves: nothing is matched, the correspondences are empty (P = 0), and the most
             similar template's pose is the best.
         refiner: improves poses; None returns coarse ones.
-        refine: "best": refine the hypothesis with the most inliers (or of the most similar template). "all": refine
-            those of all retrieved templates and keep the one with the best refined score.
+        refine: "best": refine the best hypothesis. "all": refine those of all retrieved templates and keep the one
+            whose refined pose is best: by the scorer, or by the refiner's own score where the scorer looks at
+            inliers only.
+        scorer: says which hypothesis is best; None means :class:`InlierScore`, the paper's. With
+            :class:`TopTemplatePose` there is nothing to score.
+        start: beside RANSAC's pose, each retrieved template's own pose, moved as the matches say, is polished; the
+            one with the better score is kept. None: RANSAC alone (the paper).
     """
 
     def __init__(
@@ -81,6 +100,8 @@ class FoundPose(nn.Module):
         pnp: RansacPnp | TopTemplatePose,
         refiner: PoseRefiner | None = None,
         refine: RefineWhat = "best",
+        scorer: HypothesisScorer | None = None,
+        start: TemplateStart | None = None,
     ) -> None:
         super().__init__()
         if refine not in get_args(RefineWhat):
@@ -92,6 +113,8 @@ class FoundPose(nn.Module):
         self.pnp = pnp
         self.refiner = refiner
         self.refine: RefineWhat = refine
+        self.scorer = InlierScore() if scorer is None else scorer
+        self.start = start
         self._checks = _ExtractorChecks()
 
     def forward(
@@ -139,13 +162,13 @@ class FoundPose(nn.Module):
         # Autocast is for the extractor: elsewhere half precision moves points and changes neighbours.
         with torch.autocast(crops.images.device.type, enabled=False):
             raw = select_query_patches(features, crops, self.extractor)
-            query, templates, found = self._search(objects, members, raw, crops)
+            query, templates, found, starts = self._search(objects, members, raw, crops)
             if isinstance(found, TemplatePoses):
                 correspondences, candidates = no_correspondences(query, templates), None
                 hypotheses = template_hypotheses(found, templates)
             else:
                 correspondences = found
-                hypotheses, candidates = self._solve(correspondences, query, crops)
+                hypotheses, candidates = self._solve(correspondences, query, crops, starts, objects, members)
             estimates = choose_coarse(crops, query, templates, correspondences, hypotheses, candidates)
             if self.refiner is None:
                 return estimates
@@ -168,7 +191,12 @@ class FoundPose(nn.Module):
                 image_index=torch.arange(len(crops.images)) if image_index is None else image_index,
                 meshes=[meshes] if isinstance(meshes, Mesh) else meshes,
             )
-            return choose_refined(estimates, proposals, self.refiner(proposals), rank)
+            refined = self.refiner(proposals)
+            if self.scorer.judges_poses and not isinstance(found, TemplatePoses):
+                share = _inlier_share(hypotheses.num_inliers, query).gather(1, rank)
+                score = self._score(refined.T_crop_from_model, share, query, crops, objects, members)
+                refined = refined._replace(score=score)
+            return choose_refined(estimates, proposals, refined, rank)
 
     def _check_objects(self, objects: list[ObjectRepresentation]) -> None:
         if not objects:
@@ -201,33 +229,47 @@ class FoundPose(nn.Module):
 
     def _search(
         self, objects: list[ObjectRepresentation], members: list[Tensor], raw: QueryPatches, crops: Crops
-    ) -> tuple[QueryPatches, RetrievedTemplates, Correspondences | TemplatePoses]:
-        """Retrieve and match object by object: the crops of one object share its words and templates."""
+    ) -> tuple[QueryPatches, RetrievedTemplates, Correspondences | TemplatePoses, Tensor | None]:
+        """Retrieve and match object by object: the crops of one object share its words and templates.
+
+        Returns the patches, the templates, what was found of them, and the templates' poses (B, h, 4, 4) moved as the
+        matches say, where the pipeline starts from these as well.
+        """
         parts = []
         for representation, crop_index in zip(objects, members, strict=True):
             if len(crop_index) > 0:
                 rows = indices_on(raw.valid.device, crop_index)
                 parts.append(self._search_object(representation, take_rows(raw, rows), crops, rows))
-        # Back to the order of the batch.
-        order = torch.cat(members).argsort()
-
-        def join(fields: list[Tensor]) -> Tensor:
-            return torch.cat(fields)[indices_on(fields[0].device, order)]
-
-        queries, retrieved, found = zip(*parts, strict=True)
-        return combine(queries, join), combine(retrieved, join), combine(found, join)
+        join = _back_to_batch(members)
+        queries, retrieved, found, starts = zip(*parts, strict=True)
+        T_start = None if any(T is None for T in starts) else join(list(starts))
+        return combine(queries, join), combine(retrieved, join), combine(found, join), T_start
 
     def _search_object(
         self, representation: ObjectRepresentation, raw: QueryPatches, crops: Crops, rows: Tensor
-    ) -> tuple[QueryPatches, RetrievedTemplates, Correspondences | TemplatePoses]:
+    ) -> tuple[QueryPatches, RetrievedTemplates, Correspondences | TemplatePoses, Tensor | None]:
         """Project and retrieve, then match or align templates, for the patches ``raw`` of some of the crops."""
         descriptors = raw.descriptors.to(representation.projection.components.dtype)
         query = raw._replace(descriptors=representation.projection(descriptors))
         templates = self.retriever(query, representation)
         if isinstance(self.pnp, TopTemplatePose):
             poses = self.pnp(crops.masks[rows], crops.K_crop[rows], templates.index, representation)
-            return query, templates, poses
-        return query, templates, self._match(representation, query, templates)
+            return query, templates, poses, None
+        found = self._match(representation, query, templates)
+        if self.start is None:
+            return query, templates, found, None
+        # Matches that lead back to where they come from count more.
+        trust = torch.where(found.valid, found.priority, -torch.inf).exp()
+        start = self.start(
+            found.points_image,
+            found.pixels_template,
+            trust,
+            crops.K_crop[rows],
+            representation.T_template_from_model[templates.index],
+            representation.K_template[templates.index],
+            representation.points_model.mean(dim=0),
+        )
+        return query, templates, found, start
 
     def _match(
         self, representation: ObjectRepresentation, query: QueryPatches, templates: RetrievedTemplates
@@ -242,6 +284,7 @@ class FoundPose(nn.Module):
             template_valid,
             query.pixels,
             patches.points_model,
+            representation.info.scales.get("match"),
         )
         chosen = matches.template_patch.unsqueeze(-1)
         return Correspondences(
@@ -251,35 +294,92 @@ class FoundPose(nn.Module):
             distance=matches.distance,
             weight=matches.weight.to(query.pixels),
             valid=matches.valid,
+            priority=matches.priority.to(query.pixels),
         )
 
     def _solve(
-        self, correspondences: Correspondences, query: QueryPatches, crops: Crops
+        self,
+        correspondences: Correspondences,
+        query: QueryPatches,
+        crops: Crops,
+        starts: Tensor | None,
+        objects: list[ObjectRepresentation],
+        members: list[Tensor],
     ) -> tuple[PoseHypotheses, PoseCandidates | None]:
-        """PnP for all crops and templates as one batch."""
+        """PnP for all crops and templates as one batch, from samples and from the templates' own poses."""
         B, h, P = correspondences.valid.shape
-        num_patches = query.valid.sum(dim=1, keepdim=True).clamp(min=1)
         pnp = cast(RansacPnp, self.pnp)  # the other kind has no correspondences
-        result = pnp(
+        problem = (
             correspondences.points_image.unsqueeze(1).expand(-1, h, -1, -1).reshape(B * h, P, 2),
             correspondences.points_model.reshape(B * h, P, 3),
             crops.K_crop.unsqueeze(1).expand(-1, h, -1, -1).reshape(B * h, 3, 3),
             correspondences.valid.reshape(B * h, P),
             correspondences.weight.reshape(B * h, P),
         )
-        hypotheses = PoseHypotheses(
-            T_crop_from_model=result.T_camera_from_model.reshape(B, h, 4, 4),
-            inliers=result.inliers.reshape(B, h, P),
-            num_inliers=result.num_inliers.reshape(B, h),
-            status=result.status.reshape(B, h),
-            score=result.num_inliers.reshape(B, h) / num_patches,
-        )
+
+        def scored(result: PnpResult) -> PoseHypotheses:
+            T = result.T_camera_from_model.reshape(B, h, 4, 4)
+            num_inliers = result.num_inliers.reshape(B, h)
+            share = _inlier_share(num_inliers, query)
+            return PoseHypotheses(
+                T_crop_from_model=T,
+                inliers=result.inliers.reshape(B, h, P),
+                num_inliers=num_inliers,
+                status=result.status.reshape(B, h),
+                score=self._score(T, share, query, crops, objects, members),
+            )
+
+        result = pnp(*problem, correspondences.priority.reshape(B * h, P))
+        hypotheses = scored(result)
+        if starts is not None:
+            from_starts = scored(pnp.polish_starts(starts.reshape(B * h, 4, 4), *problem))
+            hypotheses = better_of_two(hypotheses, from_starts)
         if result.candidates is None or pnp.soft_selection is None:
             return hypotheses, None
         # One choice among the candidates of all templates of a crop, in place of one for each template.
         T, score, _, valid = (x.unflatten(0, (B, h)).flatten(1, 2) for x in result.candidates)
         T = invert_transform(crops.T_crop_from_camera).unsqueeze(1) @ T
         return hypotheses, choose_softly(T, score, valid, pnp.soft_selection.temperature)
+
+    def _score(
+        self,
+        T_crop_from_model: Tensor,
+        inlier_share: Tensor,
+        query: QueryPatches,
+        crops: Crops,
+        objects: list[ObjectRepresentation],
+        members: list[Tensor],
+    ) -> Tensor:
+        """Scores (B, n) of poses (B, n, 4, 4), object by object."""
+        parts = []
+        for representation, crop_index in zip(objects, members, strict=True):
+            if len(crop_index) > 0:
+                rows = indices_on(inlier_share.device, crop_index)
+                parts.append(
+                    self.scorer(
+                        T_crop_from_model[rows],
+                        inlier_share[rows],
+                        take_rows(query, rows),
+                        crops.K_crop[rows],
+                        representation,
+                    )
+                )
+        return _back_to_batch(members)(parts)
+
+
+def _back_to_batch(members: list[Tensor]) -> Callable[[list[Tensor]], Tensor]:
+    """What joins tensors of the crops of each object, in the batch's order."""
+    order = torch.cat(members).argsort()
+
+    def join(fields: list[Tensor]) -> Tensor:
+        return torch.cat(fields)[indices_on(fields[0].device, order)]
+
+    return join
+
+
+def _inlier_share(num_inliers: Tensor, query: QueryPatches) -> Tensor:
+    """Inliers (B, h) as shares of the crops' patches."""
+    return num_inliers / query.valid.sum(dim=1, keepdim=True).clamp(min=1)
 
 
 def select_query_patches(features: PatchFeatures, crops: Crops, extractor: PatchExtractor) -> QueryPatches:

@@ -22,13 +22,10 @@ def choose_coarse(
     hypotheses: PoseHypotheses,
     candidates: PoseCandidates | None,
 ) -> PoseEstimates:
-    """Keep the hypothesis with the most inliers; of equal ones, that of the more similar template."""
-    B, h = hypotheses.num_inliers.shape
+    """Keep the hypothesis with the best score; of equal ones, that of the more similar template."""
     solved = hypotheses.status == PoseStatus.OK
-    quality = torch.where(solved, hypotheses.num_inliers, torch.full_like(hypotheses.num_inliers, -1))
-    rank = torch.arange(h, device=quality.device)
-    best = (quality * h + (h - 1 - rank)).argmax(dim=1)
-    row = torch.arange(B, device=best.device)
+    best = _first_of_best(hypotheses.score.detach().masked_fill(~solved, -torch.inf)).squeeze(1)
+    row = torch.arange(len(best), device=best.device)
     status = hypotheses.status[row, best]
     status = torch.where(query.valid.any(dim=1), status, torch.full_like(status, PoseStatus.NO_PATCHES))
     status = torch.where(crops.valid, status, torch.full_like(status, PoseStatus.UNUSABLE_MASK))
@@ -65,10 +62,7 @@ def choose_refined(
 ) -> PoseEstimates:
     """Keep the refined pose with the best score; a crop of which none could be refined keeps its coarse pose."""
     score = torch.where(refined.valid, refined.score.detach(), -torch.inf)
-    # The first of equal ones: that of the more similar template.
-    top = score.amax(dim=1, keepdim=True)
-    place = torch.arange(score.shape[1], device=score.device).expand_as(score)
-    chosen = place.masked_fill(score < top, score.shape[1]).amin(dim=1, keepdim=True)
+    chosen = _first_of_best(score)
     found = refined.valid.any(dim=1) & estimates.valid
 
     def take(x: Tensor) -> Tensor:
@@ -88,3 +82,22 @@ def choose_refined(
         best=best,
         refined=refined,
     )
+
+
+def _first_of_best(score: Tensor) -> Tensor:
+    """Places (B, 1) of the largest scores (B, n); of equal ones the first."""
+    top = score.amax(dim=1, keepdim=True)
+    place = torch.arange(score.shape[1], device=score.device).expand_as(score)
+    return place.masked_fill(score < top, score.shape[1]).amin(dim=1, keepdim=True)
+
+
+def better_of_two(ours: PoseHypotheses, theirs: PoseHypotheses) -> PoseHypotheses:
+    """For each crop and template the hypothesis with the better score; of equal ones the first's."""
+    a = ours.score.detach().masked_fill(ours.status != PoseStatus.OK, -torch.inf)
+    b = theirs.score.detach().masked_fill(theirs.status != PoseStatus.OK, -torch.inf)
+
+    def choose(x: Tensor, y: Tensor) -> Tensor:
+        better = (b > a).reshape(*a.shape, *[1] * (x.dim() - a.dim()))
+        return torch.where(better, y, x)
+
+    return PoseHypotheses(*(choose(x, y) for x, y in zip(ours, theirs, strict=True)))

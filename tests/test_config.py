@@ -77,6 +77,11 @@ def test_every_option_is_instantiated(group, option, tiny_bop, monkeypatch):
         if option == "slurm":
             assert (settings["gpus_per_node"], settings["timeout_min"]) == (1, 240)
         return
+    if group == "scene":  # of the demo
+        overrides = [f"data.root={tiny_bop}", "scene.scene_id=1", "scene.im_id=1", "scene.obj_id=2"]
+        cfg = load("demo", f"scene={option}", "extractor=dense_sift", *(overrides if option == "bop" else []))
+        assert instantiate(cfg.scene).mask.any()
+        return
     if group == "trainer":  # of an evaluation
         trainer = instantiate(load("evaluate", f"trainer={option}", "trainer.accelerator=cpu").trainer)
         assert isinstance(trainer.strategy, DDPStrategy) == (option == "ddp")
@@ -99,7 +104,8 @@ def test_every_option_is_instantiated(group, option, tiny_bop, monkeypatch):
         cfg.data.root, cfg.data.split, cfg.data.models = str(tiny_bop), "test", "models"
     if group == "extractor":
         assert isinstance(instantiate(cfg.extractor), PatchExtractor)
-        assert cfg.sigma > 0
+        assert cfg.sigma == "auto" or cfg.sigma > 0
+        assert cfg.crop.background in ("keep", "black")
     elif group in MODULES:
         assert instantiate(cfg[group]) is not None
     elif group == "data":

@@ -183,18 +183,6 @@ def test_a_picture_without_a_pose_is_a_failure(own_picture, monkeypatch, tmp_pat
     assert read_results(tmp_path / "results.csv") == []
 
 
-def test_demo_fails_when_the_pose_is_wrong(monkeypatch, tmp_path, capsys):
-    # Three templates do not show the side that the picture shows.
-    arguments = ["viewpoints.count=3", "words.num_words=32", f"representations={tmp_path}"]
-    with pytest.raises(SystemExit) as stop:
-        run_app(monkeypatch, "demo", *arguments, f"hydra.run.dir={tmp_path / 'out'}")
-    assert stop.value.code == 1
-    out = capsys.readouterr().out
-    assert "pose: WRONG" in out
-    assert "rotation error: " in out
-    assert (tmp_path / "out" / "overlay.png").stat().st_size > 10_000
-
-
 def bop_arguments(root, tmp_path):
     return [
         "experiment=oracle",

@@ -15,9 +15,10 @@ from foundpose.features import PatchExtractor
 from foundpose.geometry import PerspectiveCrop, rotation_angle
 from foundpose.matching import PatchMatcher, SoftPatchMatcher
 from foundpose.pipeline import FoundPose, select_query_patches
-from foundpose.pnp import RansacPnp, TopTemplatePose
+from foundpose.pnp import RansacPnp, TemplateStart, TopTemplatePose
 from foundpose.refinement import PoseRefiner
 from foundpose.retrieval import Retriever, TemplateRetriever
+from foundpose.verification import HypothesisScorer
 
 Refine = Literal["best", "all"]
 
@@ -40,6 +41,8 @@ class Stages(NamedTuple):
         pnp: estimates poses.
         refiner: refines poses; None leaves refinement out.
         epnp: another RANSAC that is only reported, with the paper's minimal solver; None leaves it out.
+        scorer: chooses among hypotheses; None: by inliers.
+        start: gives hypotheses beside RANSAC's; None: none.
     """
 
     crop: PerspectiveCrop
@@ -48,12 +51,22 @@ class Stages(NamedTuple):
     pnp: RansacPnp | TopTemplatePose
     refiner: PoseRefiner | None
     epnp: RansacPnp | None = None
+    scorer: HypothesisScorer | None = None
+    start: TemplateStart | None = None
 
     def pipeline(self, extractor: PatchExtractor, refine: Refine | None = None) -> FoundPose:
         """The stages composed; ``refine`` None for coarse poses."""
         refiner = None if refine is None else self.refiner
         return FoundPose(
-            self.crop, extractor, self.retriever, self.matcher, self.pnp, refiner, refine or "best"
+            self.crop,
+            extractor,
+            self.retriever,
+            self.matcher,
+            self.pnp,
+            refiner,
+            refine or "best",
+            self.scorer,
+            self.start,
         ).eval()
 
 

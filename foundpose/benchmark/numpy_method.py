@@ -17,6 +17,7 @@ def retrieve_by_template(
     sigma: float,
     num_nearest: int,
     num_templates: int,
+    root: bool = False,
 ) -> NDArray[np.int64]:
     """The most similar templates (B, h) of crops, one cosine similarity at a time.
 
@@ -29,6 +30,7 @@ def retrieve_by_template(
         sigma: of the soft assignment.
         num_nearest: words per patch.
         num_templates: h.
+        root: take square roots of the weighted frequencies, as Hellinger's kernel does.
     """
     found = []
     for crop, mask in zip(descriptors, valid, strict=True):
@@ -41,6 +43,7 @@ def retrieve_by_template(
         bow = np.zeros(len(words), dtype=x.dtype)
         np.add.at(bow, nearest, weight)
         bow = bow / max(len(x), 1) * idf
+        bow = np.sqrt(bow) if root else bow
         bow /= max(float(np.linalg.norm(bow)), 1e-12)
         similarity = [float(bow @ template) / float(np.linalg.norm(template)) for template in template_bow]
         found.append(np.argsort(-np.asarray(similarity), kind="stable")[:num_templates])

@@ -22,7 +22,7 @@ from foundpose.onboarding import ObjectRepresentation, Progress
 from foundpose.pnp import GaussNewtonPnp, RansacPnp
 from foundpose.refinement import FeaturemetricRefiner
 from foundpose.refinement.refiners import alignment_problem
-from foundpose.retrieval import TemplateRetriever, VisualWords
+from foundpose.retrieval import SpatialReranker, TemplateRetriever, VisualWords
 
 Array = NDArray[Any]
 Result = Any
@@ -107,19 +107,23 @@ def inference_references(stages: Stages, workload: Workload) -> list[Reference]:
     inputs, coarse = stage_inputs(stages, workload)
     representation = workload.representation
     references: list[Reference] = []
-    if isinstance(stages.retriever, TemplateRetriever):
+    retriever = stages.retriever
+    if isinstance(retriever, SpatialReranker):
+        retriever = retriever.retriever
+    if isinstance(retriever, TemplateRetriever) and retriever.bow.sigma != "auto":
         query = coarse.query
         arrays = (_numpy(query.descriptors), _numpy(query.valid), *_index_arrays(representation))
-        retriever, bow = stages.retriever, stages.retriever.bow
+        bow, sigma, num_templates = retriever.bow, retriever.bow.sigma, retriever.num_templates
         references.append(
             Reference(
                 "retrieval: NumPy, template by template",
                 lambda: retriever(*inputs["retriever"]).index,
                 lambda: retrieve_by_template(
                     *arrays,
-                    sigma=bow.sigma,
+                    sigma=sigma,
                     num_nearest=bow.num_nearest,
-                    num_templates=retriever.num_templates,
+                    num_templates=num_templates,
+                    root=bow.normalization == "hellinger",
                 ),
                 _same_indices("same_top"),
             )

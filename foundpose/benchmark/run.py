@@ -136,6 +136,8 @@ def make_stages(
         pnp=place(instantiate(cfg.pnp)),
         refiner=place(None if cfg.get("refiner") is None else instantiate(cfg.refiner)),
         epnp=place(epnp),
+        scorer=place(instantiate(cfg.scorer)),
+        start=place(None if cfg.get("start") is None else instantiate(cfg.start)),
     )
 
 

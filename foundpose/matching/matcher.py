@@ -6,29 +6,38 @@ import torch
 from torch import Tensor, nn
 
 from foundpose.matching.base import Matches, check_patches
-from foundpose.matching.soft import check_temperature, match_probabilities, point_confidence, point_moments
+from foundpose.matching.soft import (
+    AUTO_TEMPERATURE,
+    check_temperature,
+    match_probabilities,
+    needed_scale,
+    point_confidence,
+    point_moments,
+)
 
 MatchingMode = Literal["nearest", "cyclic"]
+
+# A cycle that ends so many pixels away counts against a match as much as the largest descriptor distance does.
+_CYCLE_UNIT = 14.0
 
 # Distances between all patches exist for one block of (crop, template) pairs at a time: 64 MiB in float32.
 _DISTANCES_PER_BLOCK = 1 << 24
 
 
 def nearest_patches(
-    query: Tensor, query_valid: Tensor, template: Tensor, template_valid: Tensor, with_return: bool
-) -> tuple[Tensor, Tensor | None]:
-    """Nearest valid template patch of each query patch, and optionally the way back.
+    query: Tensor, query_valid: Tensor, template: Tensor, template_valid: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Nearest valid template patch of each query patch, and the way back.
 
     Args:
         query: (n, P, d) descriptors.
         query_valid: (n, P) bool.
         template: (n, Q, d) descriptors.
         template_valid: (n, Q) bool.
-        with_return: whether to search the other direction too.
 
     Returns:
         Template patch of each query patch (n, P), and the nearest valid query patch of that template patch
-        (n, P) or None. Of equally near patches the one with the lowest index; meaningless where there is none.
+        (n, P). Of equally near patches the one with the lowest index; meaningless where there is none.
 
     Not differentiable (indices).
     """
@@ -37,8 +46,6 @@ def nearest_patches(
     # |q|² is the same for all template patches, so one direction does not need it.
     score = torch.baddbmm(template_norm.unsqueeze(1), query, template.transpose(1, 2), alpha=-2.0)
     forth = score.argmin(dim=2)
-    if not with_return:
-        return forth, None
     query_norm = query.square().sum(dim=-1).masked_fill(~query_valid, torch.inf)
     back = (score + query_norm.unsqueeze(2)).argmin(dim=1)
     return forth, back.gather(1, forth)
@@ -69,8 +76,9 @@ def match_patches(
     query_valid: Tensor,
     template: Tensor,
     template_valid: Tensor,
-    query_pixels: Tensor | None,
+    query_pixels: Tensor,
     template_points: Tensor,
+    mode: MatchingMode,
     top_k: int | None,
     temperature: float | None = None,
 ) -> Matches:
@@ -81,8 +89,9 @@ def match_patches(
         query_valid: (B, P) bool.
         template: (B, h, Q, d), finite.
         template_valid: (B, h, Q) bool.
-        query_pixels: (B, P, 2) to rank matches by cycle distance, or None.
+        query_pixels: (B, P, 2).
         template_points: (B, h, Q, 3), finite.
+        mode: whether ``top_k`` ranks by cycle distance.
         top_k: number of matches to keep per template, or None for all.
         temperature: of the confidences, or None for ones.
 
@@ -94,7 +103,8 @@ def match_patches(
     if min(B, h, P, Q) == 0:
         nothing = query_valid.new_zeros(B, h, P)
         zero = query.new_zeros(B, h, P)
-        return Matches(nothing.long(), zero + torch.inf, nothing, template_points.new_zeros(B, h, P, 3), zero)
+        points = template_points.new_zeros(B, h, P, 3)
+        return Matches(nothing.long(), zero + torch.inf, nothing, points, zero, zero - torch.inf)
     template, template_valid = template.flatten(0, 1), template_valid.flatten(0, 1)
     points = template_points.flatten(0, 1)
     crop = torch.arange(B * h, device=query.device) // h
@@ -104,19 +114,19 @@ def match_patches(
         mine = crop[block]
         q, q_valid = query.index_select(0, mine), query_valid[mine]
         t, t_valid, x = template[block], template_valid[block], points[block]
-        forth, back = nearest_patches(q, q_valid, t, t_valid, query_pixels is not None)
+        forth, back = nearest_patches(q, q_valid, t, t_valid)
         ok = q_valid & t_valid.any(dim=1, keepdim=True)
         nearest = t.gather(1, forth.unsqueeze(-1).expand_as(q))
         # From the difference, not from the expanded square: accurate near zero.
         length = torch.linalg.vector_norm(q - nearest, dim=-1)
+        pixels = query_pixels[mine]
+        cycle = torch.linalg.vector_norm(
+            pixels - pixels.gather(1, back.unsqueeze(-1).expand_as(pixels)), dim=-1
+        )
         if top_k is not None:
-            cycle = None
-            if query_pixels is not None and back is not None:
-                pixels = query_pixels[mine]
-                cycle = torch.linalg.vector_norm(
-                    pixels - pixels.gather(1, back.unsqueeze(-1).expand_as(pixels)), dim=-1
-                )
-            ok = keep_best(ok, cycle, length, top_k)
+            ok = keep_best(ok, cycle if mode == "cyclic" else None, length, top_k)
+        largest = length.detach().masked_fill(~ok, 0.0).amax(dim=-1, keepdim=True)
+        priority = -cycle / _CYCLE_UNIT - length.detach() / largest.where(largest > 0, 1.0)
         chosen = x.gather(1, forth.unsqueeze(-1).expand(-1, -1, 3))
         if temperature is None:
             weight = torch.ones_like(length)
@@ -131,6 +141,7 @@ def match_patches(
                 ok,
                 chosen.masked_fill(~ok.unsqueeze(-1), 0.0),
                 weight.masked_fill(~ok, 0.0),
+                priority.masked_fill(~ok, -torch.inf),
             )
         )
     return Matches(*(torch.cat(parts).unflatten(0, (B, h)) for parts in zip(*blocks, strict=True)))
@@ -146,7 +157,8 @@ class PatchMatcher(nn.Module):
             descriptor distance, then by index; None keeps all, and then both modes give the same.
         confidence_temperature: gives each match the confidence that :class:`SoftPatchMatcher` has at this temperature
             that the patch lies where it was matched to, so that a pose estimated from the weighted matches has a
-            gradient in the descriptors. None: all matches weigh the same (the paper), and a pose has none.
+            gradient in the descriptors; "auto" as there. None: all matches weigh the same (the paper), and a pose
+            has none.
 
     Source: paper, "Crop-to-template patch matching"; cyclic: Goodwin et al., ECCV 2022.
     """
@@ -155,7 +167,7 @@ class PatchMatcher(nn.Module):
         self,
         mode: MatchingMode = "nearest",
         top_k: int | None = None,
-        confidence_temperature: float | None = None,
+        confidence_temperature: float | Literal["auto"] | None = None,
     ) -> None:
         super().__init__()
         if mode not in ("nearest", "cyclic"):
@@ -166,7 +178,7 @@ class PatchMatcher(nn.Module):
             check_temperature(confidence_temperature)
         self.mode = mode
         self.top_k = top_k
-        self.confidence_temperature = confidence_temperature
+        self.confidence_temperature: float | Literal["auto"] | None = confidence_temperature
 
     def forward(
         self,
@@ -176,6 +188,7 @@ class PatchMatcher(nn.Module):
         template_valid: Tensor,
         query_pixels: Tensor,
         template_points: Tensor,
+        match_distance: float | None = None,
     ) -> Matches:
         """Match B crops with h templates each.
 
@@ -184,8 +197,9 @@ class PatchMatcher(nn.Module):
             query_valid: (B, P) bool.
             template_descriptors: (B, h, Q, d).
             template_valid: (B, h, Q) bool.
-            query_pixels: (B, P, 2) patch centres in the crop, pixels (read in mode "cyclic" only).
+            query_pixels: (B, P, 2) patch centres in the crop, pixels.
             template_points: (B, h, Q, 3) the template patches' points, mesh units.
+            match_distance: median distance of right matches; for an automatic temperature.
 
         Returns:
             One match per crop patch and template; not valid where the patch is not, where the template has no
@@ -206,15 +220,19 @@ class PatchMatcher(nn.Module):
             query_pixels,
             template_points,
         )
+        temperature = self.confidence_temperature
+        if temperature == "auto":
+            temperature = AUTO_TEMPERATURE * needed_scale(match_distance)
         return match_patches(
             query_descriptors,
             query_valid,
             template_descriptors,
             template_valid,
-            query_pixels if self.mode == "cyclic" else None,
+            query_pixels,
             template_points,
+            self.mode,
             self.top_k,
-            self.confidence_temperature,
+            temperature,
         )
 
     def extra_repr(self) -> str:

@@ -1,11 +1,15 @@
 """Soft matching: a distribution over the template's patches for each patch of the crop."""
 
 import math
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
 from foundpose.matching.base import Matches, check_patches
+
+AUTO_TEMPERATURE = 0.15
+"""Temperature as a share of the median distance of right matches, where it is to be measured."""
 
 
 class SoftPatchMatcher(nn.Module):
@@ -20,22 +24,27 @@ class SoftPatchMatcher(nn.Module):
     puts it at a wrong depth: keep τ well below the distance of neighbouring patches' descriptors.
 
     Args:
-        temperature: τ, in the unit of the descriptors.
+        temperature: τ, in the unit of the descriptors; or "auto": 0.15 of the median distance of right matches
+            between the object's templates, which onboarding measures.
         learnable: make τ (by its logarithm) a parameter.
 
     Raises:
-        ValueError: ``temperature`` is not positive.
+        ValueError: ``temperature`` is not positive; or automatic and to be learned.
 
     Source: soft nearest neighbours, Plötz and Roth, "Neural nearest neighbors networks", NeurIPS 2018.
     """
 
     log_temperature: Tensor
 
-    def __init__(self, temperature: float, learnable: bool = False) -> None:
+    def __init__(self, temperature: float | Literal["auto"], learnable: bool = False) -> None:
         super().__init__()
         check_temperature(temperature)
+        self.automatic = temperature == "auto"
+        if self.automatic and learnable:
+            raise ValueError("a temperature that is learned needs a number to start from, got 'auto'")
         self.learnable = learnable
-        value = torch.tensor(math.log(temperature))
+        # An automatic one is a multiple of the object's scale.
+        value = torch.tensor(math.log(AUTO_TEMPERATURE if temperature == "auto" else temperature))
         if learnable:
             self.log_temperature = nn.Parameter(value)
         else:
@@ -43,7 +52,7 @@ class SoftPatchMatcher(nn.Module):
 
     @property
     def temperature(self) -> Tensor:
-        """τ, a scalar tensor."""
+        """τ, a scalar tensor; an automatic one as a share of the right matches' distance."""
         return self.log_temperature.exp()
 
     def forward(
@@ -54,6 +63,7 @@ class SoftPatchMatcher(nn.Module):
         template_valid: Tensor,
         query_pixels: Tensor,
         template_points: Tensor,
+        match_distance: float | None = None,
     ) -> Matches:
         """Match B crops with h templates each.
 
@@ -64,6 +74,7 @@ class SoftPatchMatcher(nn.Module):
             template_valid: (B, h, Q) bool.
             query_pixels: (B, P, 2) patch centres in the crop, pixels (not read).
             template_points: (B, h, Q, 3) the template patches' points, mesh units.
+            match_distance: median distance of right matches; for an automatic temperature.
 
         Returns:
             One match per crop patch and template, with expected points and confidences; ``template_patch`` is the
@@ -97,7 +108,10 @@ class SoftPatchMatcher(nn.Module):
         query = query.masked_fill(~valid.unsqueeze(-1), 0.0)
         template, points = (x.masked_fill(~t_valid.unsqueeze(-1), 0.0) for x in (template, points))
 
-        probability = match_probabilities(query, template, t_valid, self.temperature.to(query.dtype))
+        temperature = self.temperature.to(query.dtype)
+        if self.automatic:
+            temperature = temperature * needed_scale(match_distance)
+        probability = match_probabilities(query, template, t_valid, temperature)
         expected, variance = point_moments(probability, points, t_valid)
         weight = point_confidence(variance, points, t_valid)
         patch = probability.detach().argmax(dim=-1) if P > 0 else valid.long()
@@ -112,6 +126,7 @@ class SoftPatchMatcher(nn.Module):
                     valid,
                     expected.masked_fill(~valid.unsqueeze(-1), 0.0),
                     weight.masked_fill(~valid, 0.0),
+                    weight.detach().masked_fill(~valid, -torch.inf),
                 )
             )
         )
@@ -119,6 +134,13 @@ class SoftPatchMatcher(nn.Module):
     def extra_repr(self) -> str:
         """Settings, for printing."""
         return f"temperature={self.temperature.item():g}, learnable={self.learnable}"
+
+
+def needed_scale(match_distance: float | None) -> float:
+    """The scale of an automatic temperature; raises ValueError without one."""
+    if match_distance is None:
+        raise ValueError("the temperature is auto: give match_distance, or set it to a number")
+    return match_distance
 
 
 def match_probabilities(
@@ -201,7 +223,9 @@ def point_confidence(variance: Tensor, points: Tensor, valid: Tensor) -> Tensor:
     return (spacing + tiny) / (spacing + tiny + variance)
 
 
-def check_temperature(temperature: float) -> None:
-    """Raise ValueError unless the temperature is positive and finite."""
-    if not 0.0 < temperature < math.inf:
+def check_temperature(temperature: float | str) -> None:
+    """Raise ValueError unless the temperature is positive and finite, or "auto"."""
+    if temperature == "auto":
+        return
+    if isinstance(temperature, str) or not 0.0 < temperature < math.inf:
         raise ValueError(f"temperature must be positive (in the unit of the descriptors), got {temperature}")

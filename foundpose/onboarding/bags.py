@@ -5,7 +5,7 @@ from torch import Tensor
 
 from foundpose.onboarding.representation import ObjectRepresentation
 from foundpose.retrieval import IdfMode, SoftAssignBow, WordAssignment
-from foundpose.retrieval.bow import inverse_document_frequency, tf_idf, word_counts
+from foundpose.retrieval.bow import inverse_document_frequency, word_counts
 from foundpose.retrieval.retriever import normalize_rows
 
 
@@ -14,13 +14,14 @@ def describe_by_words(
 ) -> tuple[Tensor, Tensor]:
     """Inverse document frequencies (k,) and L2-normalised bags of words (T, k) of an object's templates."""
     words, valid = [], []
+    distance = representation.info.scale("word", "sigma") if bow.sigma == "auto" else None
     for index in torch.arange(representation.num_templates, device=representation.words.device).split(
         batch_size
     ):
         patches = representation.gather_templates(index)
-        words.append(bow.assign(patches.descriptors, patches.valid, representation.words))
+        words.append(bow.assign(patches.descriptors, patches.valid, representation.words, distance))
         valid.append(patches.valid)
     assignment = WordAssignment(*(torch.cat(parts) for parts in zip(*words, strict=True)))
     num_words = len(representation.words)
     idf = inverse_document_frequency(assignment, torch.cat(valid), num_words, idf_mode)
-    return idf, normalize_rows(tf_idf(word_counts(assignment, num_words), idf))
+    return idf, normalize_rows(bow.weigh(word_counts(assignment, num_words), idf))

@@ -3,6 +3,7 @@
 import copy
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from itertools import chain
 from typing import TypeVar, get_args
 
@@ -17,6 +18,7 @@ from foundpose.onboarding.compression import dequantize, quantize
 from foundpose.onboarding.prefetch import pin, prefetch, upload
 from foundpose.onboarding.quantization import Storage, check_storage
 from foundpose.onboarding.representation import ObjectRepresentation, RepresentationInfo
+from foundpose.onboarding.scales import measure_scales
 from foundpose.onboarding.stages import (
     FittedWords,
     PatchTable,
@@ -339,6 +341,8 @@ class Onboarder(nn.Module):
             ),
         ).to(device)
         report("bags of words", 0, 1)
+        scales = measure_scales(representation).known()
+        representation.info = replace(representation.info, scales=scales)
         idf, template_bow = describe_by_words(representation, self.bow, self.idf_mode)
         representation.idf.copy_(idf)
         representation.template_bow.copy_(template_bow)

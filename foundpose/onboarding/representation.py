@@ -35,6 +35,8 @@ class RepresentationInfo:
         grid: number of patches along a side.
         settings: further settings of the onboarding, for the record.
         schema_version: version of the file format.
+        scales: of the descriptors, by name, see :class:`foundpose.onboarding.scales.DescriptorScales`; those that the
+            templates do not show are left out.
     """
 
     name: str
@@ -47,6 +49,21 @@ class RepresentationInfo:
     grid: int
     settings: dict[str, str | int | float | bool | None] = field(default_factory=dict)
     schema_version: int = SCHEMA_VERSION
+    scales: dict[str, float] = field(default_factory=dict)
+
+    def scale(self, name: str, setting: str) -> float:
+        """A scale of the descriptors, for a setting that is "auto".
+
+        Raises:
+            ValueError: it was not measured; the message says which setting to set.
+        """
+        if name not in self.scales:
+            raise ValueError(
+                f"{setting} is auto, but the representation of {self.name!r} has no measured scale {name!r}: "
+                f"onboard the "
+                f"object again, with more templates if there were few, or set {setting} to a number"
+            )
+        return self.scales[name]
 
 
 class TemplatePatches(NamedTuple):
@@ -145,22 +162,26 @@ class ObjectRepresentation(nn.Module):
         """Number of templates T."""
         return len(self.template_offsets) - 1
 
-    def read_descriptors(self, rows: Tensor) -> Tensor:
+    def read_descriptors(self, rows: Tensor, components: int | None = None) -> Tensor:
         """Descriptors (..., d) of patches (...), which are rows of ``descriptors``, decoded where they are codes.
 
-        They come in the type of the projection's components, whatever type they are stored in.
+        They come in the type of the projection's components, whatever type they are stored in. With ``components``
+        only so many leading components are returned, and read where they are not codes.
 
         Differentiable w.r.t. the buffer ``descriptors``, unless it holds codes, which are constants.
         """
         # Rows are copied whole, several times as fast as by indexing.
-        stored = self.descriptors.index_select(0, rows.flatten())
+        table = self.descriptors if self.codec is not None else self.descriptors[:, :components]
+        stored = table.index_select(0, rows.flatten())
         if self.codec is not None:
-            stored = self.codec.decode(stored)
+            stored = self.codec.decode(stored)[:, :components]
         # Converted after the gather: all of them in float32 would undo what storage in less saves.
         return stored.to(self.projection.components.dtype).reshape(*rows.shape, stored.shape[1])
 
-    def gather_templates(self, index: Tensor) -> TemplatePatches:
+    def gather_templates(self, index: Tensor, components: int | None = None) -> TemplatePatches:
         """Patches of templates: any shape of template indices (...) → (..., Q, ·), Q the largest template's count.
+
+        With ``components`` descriptors have only so many leading components.
 
         Only the rows of these templates are read, which is all that a file mapped into memory then loads.
 
@@ -172,7 +193,7 @@ class ObjectRepresentation(nn.Module):
         valid = position < count.unsqueeze(-1)
         rows = torch.where(valid, start.unsqueeze(-1) + position, torch.zeros_like(position))
         keep = valid.unsqueeze(-1)
-        gathered = self.read_descriptors(rows)
+        gathered = self.read_descriptors(rows, components)
         descriptors = torch.where(keep, gathered, gathered.new_zeros(()))
         points = self.points_model.index_select(0, rows.flatten()).unflatten(0, rows.shape)
         points_model = torch.where(keep, points, points.new_zeros(()))
@@ -180,6 +201,15 @@ class ObjectRepresentation(nn.Module):
         columns_rows = torch.stack([cell % self.info.grid, cell // self.info.grid], dim=-1)
         pixels = columns_rows.to(self.points_model.dtype) * self.info.stride + self.info.offset
         return TemplatePatches(descriptors, points_model, pixels, valid)
+
+    def nearest_views(self, T_camera_from_model: Tensor, count: int = 1) -> Tensor:
+        """Indices (..., count) of the templates that see the object most as poses (..., 4, 4) do, nearest first.
+
+        Not differentiable (indices).
+        """
+        R = T_camera_from_model[..., :3, :3].flatten(-2)
+        views = self.T_template_from_model[:, :3, :3].flatten(1).to(R)
+        return (R @ views.T).topk(min(count, len(views)), dim=-1).indices
 
     def with_storage(self, storage: Storage, subspaces: int = 64) -> Self:
         """The same representation with its descriptors kept otherwise; the other buffers are shared.

@@ -7,6 +7,7 @@ from foundpose.pnp.polish import polish_pnp
 from foundpose.pnp.ransac import PnpResult, PnpStatus, RansacPnp
 from foundpose.pnp.soft_selection import PoseCandidates, SoftInlierSelection
 from foundpose.pnp.template_pose import TemplatePoses, TopTemplatePose
+from foundpose.pnp.template_start import TemplateStart
 
 __all__ = [
     "GaussNewtonPnp",
@@ -19,6 +20,7 @@ __all__ = [
     "RansacPnp",
     "SoftInlierSelection",
     "TemplatePoses",
+    "TemplateStart",
     "TopTemplatePose",
     "polish_pnp",
     "solve_epnp",

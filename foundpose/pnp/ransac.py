@@ -19,6 +19,9 @@ from foundpose.pnp.weak_perspective import mirrored_poses
 _ROUGH = 1e-2
 # Steps that a mirrored pose is given to show that it is the better one.
 _MIRROR_STEPS = 4
+# A rough start's inliers are those within so many thresholds, and it is given so many steps on them, in turn.
+_WIDE = (2.8, 1.4)
+_WIDE_STEPS = 4
 
 
 class PnpStatus(IntEnum):
@@ -85,6 +88,8 @@ class RansacPnp(nn.Module):
             ``GaussNewtonPnp(max_iterations=10)``.
         soft_selection: also return the best hypotheses with the probability of choosing them, for losses on the
             expected pose error (DSAC). The pose returned is the same as without.
+        guidance: how much samples prefer correspondences of high priority, where priorities are given: the rank of
+            each member is that of a uniform one raised to this power (as a share of the ranks). 1: no preference.
         seed: seed of the samples.
         score_points: at most this many correspondences of a problem, evenly spread, score its samples; None means
             all. The polish and the inliers returned are always those of all correspondences.
@@ -96,6 +101,7 @@ class RansacPnp(nn.Module):
     """
 
     draws: Tensor
+    guided_draws: Tensor
 
     def __init__(
         self,
@@ -111,9 +117,12 @@ class RansacPnp(nn.Module):
         seed: int = 0,
         score_points: int | None = 128,
         chunk: int | None = None,
+        guidance: float = 2.0,
     ) -> None:
         super().__init__()
         check_solver(solver)
+        if not guidance >= 1:
+            raise ValueError(f"guidance must be at least 1, got {guidance}")
         if iterations < 1 or (chunk is not None and chunk < 1):
             raise ValueError(f"iterations and chunk must be at least 1, got {iterations} and {chunk}")
         if score_points is not None and score_points < SAMPLE_SIZE:
@@ -136,10 +145,14 @@ class RansacPnp(nn.Module):
         self.soft_selection = soft_selection
         self.score_points = score_points
         self.chunk = chunk
+        self.guidance = guidance
         generator = torch.Generator().manual_seed(seed)
         # Integers, so that every device turns them into the same indices.
         draws = torch.randint(2**31, (iterations, SAMPLE_SIZE), generator=generator)
         self.register_buffer("draws", draws, persistent=False)
+        # Of ranks by priority: the smaller, the better.
+        guided = ((draws.double() / 2**31) ** guidance * 2**31).long()
+        self.register_buffer("guided_draws", guided, persistent=False)
 
     def forward(
         self,
@@ -148,6 +161,7 @@ class RansacPnp(nn.Module):
         K: Tensor,
         valid: Tensor | None = None,
         weights: Tensor | None = None,
+        priority: Tensor | None = None,
     ) -> PnpResult:
         """Estimate one pose per problem.
 
@@ -160,6 +174,8 @@ class RansacPnp(nn.Module):
             weights: (B, N), how much each counts in the polish; None means all the same. Those whose weight is not
                 positive (or no number) do not exist. Sampling and inlier counts do not look at weights, a soft
                 selection does.
+            priority: (B, N), the larger the more often a correspondence is sampled (see ``guidance``); None: all
+                alike. Only their order counts.
 
         Returns:
             A :class:`PnpResult`.
@@ -175,9 +191,10 @@ class RansacPnp(nn.Module):
         """
         check_correspondences(points_image, points_model, K, valid, name="valid")
         check_correspondences(points_image, points_model, K, weights)
+        check_correspondences(points_image, points_model, K, priority, name="priority")
         # Autocast would run the matrix products in half precision, too coarse for poses.
         with torch.autocast(points_image.device.type, enabled=False):
-            return self._estimate(points_image, points_model, K, valid, weights)
+            return self._estimate(points_image, points_model, K, valid, weights, priority)
 
     def _estimate(
         self,
@@ -186,23 +203,15 @@ class RansacPnp(nn.Module):
         K: Tensor,
         valid: Tensor | None,
         weights: Tensor | None,
+        priority: Tensor | None,
     ) -> PnpResult:
         invertible = invertible_intrinsics(K)
-        K = torch.where(invertible[:, None, None], K, torch.eye(3, dtype=K.dtype, device=K.device))
-        rays = pixel_rays(points_image.detach(), K.detach())
-        sane = usable_coordinates(points_image) & usable_coordinates(points_model) & usable_coordinates(rays)
-        valid = sane if valid is None else sane & valid.bool()
-        if weights is not None:
-            weights = weights.to(points_image.dtype)
-            valid = valid & (weights > 0) & torch.isfinite(weights)
-            weights = weights.masked_fill(~valid, 0.0)
-        points_image = points_image.masked_fill(~valid.unsqueeze(-1), 0.0)
-        points_model = points_model.masked_fill(~valid.unsqueeze(-1), 0.0)
-
+        K, valid, problem = self._problem(points_image, points_model, K, valid, weights)
+        points_image, points_model, weights = problem.points_image, problem.points_model, problem.weights
         count = valid.sum(-1)
-        hypotheses = self._sample(points_image, points_model, K, valid, (count >= SAMPLE_SIZE) & invertible)
+        usable = (count >= SAMPLE_SIZE) & invertible
+        hypotheses = self._sample(points_image, points_model, K, valid, usable, priority)
         kept = hypotheses.T.shape[1]
-        problem = _Problem(points_image, points_model, K, valid, weights)
         found = hypotheses.quality.flatten() >= 0
         T = torch.where(
             found[:, None, None],
@@ -226,13 +235,50 @@ class RansacPnp(nn.Module):
         # The first hypothesis is the best.
         T, inliers, regular, found = T[::kept], inliers[::kept], regular[::kept], found[:, 0]
 
+        return self._result(T, inliers, regular, found, hypotheses.determined, count, problem, candidates)
+
+    def _problem(
+        self,
+        points_image: Tensor,
+        points_model: Tensor,
+        K: Tensor,
+        valid: Tensor | None,
+        weights: Tensor | None,
+    ) -> tuple[Tensor, Tensor, "_Problem"]:
+        """Intrinsics as they are usable, which correspondences exist, and all of it without what does not."""
+        K = torch.where(
+            invertible_intrinsics(K)[:, None, None], K, torch.eye(3, dtype=K.dtype, device=K.device)
+        )
+        rays = pixel_rays(points_image.detach(), K.detach())
+        sane = usable_coordinates(points_image) & usable_coordinates(points_model) & usable_coordinates(rays)
+        valid = sane if valid is None else sane & valid.bool()
+        if weights is not None:
+            weights = weights.to(points_image.dtype)
+            valid = valid & (weights > 0) & torch.isfinite(weights)
+            weights = weights.masked_fill(~valid, 0.0)
+        points_image = points_image.masked_fill(~valid.unsqueeze(-1), 0.0)
+        points_model = points_model.masked_fill(~valid.unsqueeze(-1), 0.0)
+        return K, valid, _Problem(points_image, points_model, K, valid, weights)
+
+    def _result(
+        self,
+        T: Tensor,
+        inliers: Tensor,
+        regular: Tensor,
+        found: Tensor,
+        determined: Tensor,
+        count: Tensor,
+        problem: "_Problem",
+        candidates: PoseCandidates | None,
+    ) -> PnpResult:
+        """Polished poses with their statuses and errors."""
         num_inliers = inliers.sum(-1)
         status = torch.full_like(num_inliers, int(PnpStatus.OK))
         status = status.masked_fill(num_inliers < self.min_inliers, int(PnpStatus.TOO_FEW_INLIERS))
         status = status.masked_fill(~found, int(PnpStatus.BEHIND_CAMERA))
-        status = status.masked_fill(~hypotheses.determined, int(PnpStatus.DEGENERATE))
+        status = status.masked_fill(~determined, int(PnpStatus.DEGENERATE))
         status = status.masked_fill(count < SAMPLE_SIZE, int(PnpStatus.TOO_FEW_CORRESPONDENCES))
-        squared, _ = reprojection_errors(T, points_image, points_model, K)
+        squared, _ = reprojection_errors(T, *problem[:3])
         mean = torch.where(inliers, squared, torch.zeros_like(squared)).sum(-1) / num_inliers.clamp(min=1)
         # The clamp keeps the square root's derivative finite for data that fit exactly.
         rmse = mean.clamp(min=torch.finfo(mean.dtype).tiny).sqrt()
@@ -240,8 +286,62 @@ class RansacPnp(nn.Module):
         success = status == int(PnpStatus.OK)
         return PnpResult(T, inliers, num_inliers, success, status, rmse, regular, candidates)
 
+    def polish_starts(
+        self,
+        T: Tensor,
+        points_image: Tensor,
+        points_model: Tensor,
+        K: Tensor,
+        valid: Tensor,
+        weights: Tensor | None = None,
+    ) -> PnpResult:
+        """Polish rough poses on their inliers, in place of sampling.
+
+        Args:
+            T: (B, 4, 4) poses; inliers are first looked for at a few times the threshold.
+            points_image: (B, N, 2) pixels.
+            points_model: (B, N, 3) mesh units.
+            K: (B, 3, 3) intrinsics.
+            valid: (B, N) bool.
+            weights: (B, N), see :meth:`forward`.
+
+        Returns:
+            As :meth:`forward`, without ``candidates``.
+
+        Raises:
+            ValueError: shapes or dtypes do not fit.
+
+        Differentiable as :meth:`forward`; the starts are constants.
+        """
+        check_correspondences(points_image, points_model, K, valid, name="valid")
+        check_correspondences(points_image, points_model, K, weights)
+        with torch.autocast(points_image.device.type, enabled=False):
+            invertible = invertible_intrinsics(K)
+            K, valid, problem = self._problem(points_image, points_model, K, valid, weights)
+            T = T.detach().to(problem.K)
+            sane = torch.isfinite(T).all(-1).all(-1)
+            T = torch.where(sane[:, None, None], T, _pose_in_front(problem.points_model.detach(), valid))
+            with torch.no_grad():
+                for factor in _WIDE:
+                    inliers, _ = select_inliers(
+                        T, *problem[:4], factor * self.threshold, problem.weights, self.polish.loss
+                    )
+                    enough = inliers.sum(-1) >= SAMPLE_SIZE
+                    rough = self.polish.optimise(T, *problem[:3], problem.weigh(inliers), _ROUGH, _WIDE_STEPS)
+                    T = torch.where(enough[:, None, None], rough[0].T, T)
+            count = valid.sum(-1)
+            found = sane & invertible & (count >= SAMPLE_SIZE)
+            T, inliers, regular = self._polish(T, found, problem, mirror=False)
+            return self._result(T, inliers, regular, found, torch.ones_like(found), count, problem, None)
+
     def _sample(
-        self, points_image: Tensor, points_model: Tensor, K: Tensor, valid: Tensor, usable: Tensor
+        self,
+        points_image: Tensor,
+        points_model: Tensor,
+        K: Tensor,
+        valid: Tensor,
+        usable: Tensor,
+        priority: Tensor | None,
     ) -> Hypotheses:
         return sample_hypotheses(
             points_image.detach(),
@@ -249,7 +349,8 @@ class RansacPnp(nn.Module):
             K.detach(),
             valid,
             usable,
-            self.draws,
+            self.draws if priority is None else self.guided_draws,
+            priority=None if priority is None else priority.detach(),
             solver=self.solver,
             threshold=self.threshold,
             confidence=self.confidence,
@@ -258,14 +359,16 @@ class RansacPnp(nn.Module):
             keep=1 if self.soft_selection is None else self.soft_selection.num_candidates,
         )
 
-    def _polish(self, T: Tensor, found: Tensor, problem: "_Problem") -> tuple[Tensor, Tensor, Tensor]:
+    def _polish(
+        self, T: Tensor, found: Tensor, problem: "_Problem", mirror: bool = True
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Polish poses (P, 4, 4) on their inliers; return them, the inliers (P, N) that they end up with, and which
         have a gradient (P,)."""
         unrolled = self.polish.differentiation == "unrolled" and torch.is_grad_enabled()
         with torch.set_grad_enabled(unrolled):
             rounds = self.polish_rounds - 1
             state = self._climb(_Polished(T, *self._select(T, problem)), found, problem, rounds)
-            if self.mirror:
+            if self.mirror and mirror:
                 mirrored = mirrored_poses(state.T, problem.points_model, problem.weigh(state.inliers))
                 start = _Polished(mirrored, *self._select(mirrored, problem))
                 # A solid object does not look like its mirror image: most problems end here.

@@ -78,6 +78,7 @@ def sample_hypotheses(
     usable: Tensor,
     draws: Tensor,
     *,
+    priority: Tensor | None = None,
     solver: SolverName,
     threshold: float,
     confidence: float | None,
@@ -93,7 +94,8 @@ def sample_hypotheses(
         K: (B, 3, 3), invertible.
         valid: (B, N) bool.
         usable: (B,) bool, problems to look at; they have at least four valid correspondences.
-        draws: (I, 4) integers in [0, 2³¹), the same for all problems.
+        draws: (I, 4) integers in [0, 2³¹), the same for all problems; small ones stand for high priorities.
+        priority: (B, N); None: that of the order given.
         solver: minimal solver.
         threshold: of an inlier, pixels.
         confidence: a problem's samples count until an all-inlier sample has been drawn with this probability (and 50
@@ -113,13 +115,21 @@ def sample_hypotheses(
         return Hypotheses(best_T, best_quality, determined)
     # Valid correspondences first, so that a rank among the valid ones becomes an index.
     order = torch.argsort((~valid).to(torch.uint8), dim=-1, stable=True)
+    spread = order
+    if priority is not None:
+        last = priority.nan_to_num(nan=-torch.inf).masked_fill(~valid, -torch.inf)
+        by_priority = last.argsort(dim=-1, descending=True, stable=True)
+        # Priorities of −inf stay before what is not valid.
+        order = by_priority.gather(
+            -1, (~valid.gather(-1, by_priority)).to(torch.uint8).argsort(dim=-1, stable=True)
+        )
     data = _Correspondences(
         pixel_rays(points_image, K),
         points_model,
         K,
         order,
         valid.sum(-1),
-        *_scored_points(points_image, points_model, valid, order, score_points),
+        *_scored_points(points_image, points_model, valid, spread, score_points),
     )
     # All problems take part in the first chunk, also those that are not usable: to leave them out would cost a look.
     rows: Tensor | None = None

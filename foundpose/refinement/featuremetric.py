@@ -19,6 +19,7 @@ from foundpose.pnp.polish import LocalFrame, project_in_frame
 from foundpose.refinement.interpolation import Interpolation, sample_features
 
 ResidualKind = Literal["channel", "norm"]
+AutoScale = bool | Literal["object"]
 
 _OF_EACH_POSE = ("map_index", "K", "descriptors", "points_model", "valid")
 # Numbers of the descriptors of the poses that are aligned at once.
@@ -38,6 +39,8 @@ class AlignmentProblem(NamedTuple):
         descriptors: (n, P, d) of the template's patches.
         points_model: (n, P, 3) mesh units.
         valid: (n, P) bool.
+        sizes: (n,) size of the residual that right matches of each pose's object leave, in the alignment's kind of
+            residual; for ``auto_scale="object"``.
     """
 
     features: Tensor
@@ -49,11 +52,12 @@ class AlignmentProblem(NamedTuple):
     descriptors: Tensor
     points_model: Tensor
     valid: Tensor
+    sizes: Tensor | None = None
 
     def take(self, rows: slice) -> "AlignmentProblem":
         """The part of some of the poses."""
         mine = {name: getattr(self, name)[rows] for name in _OF_EACH_POSE}
-        return self._replace(**mine)
+        return self._replace(**mine, sizes=None if self.sizes is None else self.sizes[rows])
 
 
 class Alignment(NamedTuple):
@@ -97,8 +101,11 @@ class FeaturemetricAlignment(nn.Module):
             at right poses, or set ``auto_scale``.
         residual: "channel": ρ of each channel's residual, summed. "norm": ρ of the residual's length.
         normalize: compare descriptors of unit length.
-        auto_scale: take for c, whatever the loss's own is, the residuals' robust standard deviation at the initial
-            pose (1.4826 times their median magnitude), for each pose.
+        auto_scale: what c is a multiple of. False: c is the loss's own scale. "object": the loss's scale times the
+            residual of right matches between the object's templates, which onboarding measures. True: c is,
+            whatever the loss's own is, the residuals' robust standard deviation at the initial pose (1.4826 times
+            their median magnitude), for each pose; slower, as that is larger than what right matches leave, and the
+            cost flatter.
         interpolation: of the feature map; "bicubic" has continuous slopes.
         max_iterations: upper limit on the steps tried.
         tolerance: relative decrease of the cost that counts as converged.
@@ -115,7 +122,7 @@ class FeaturemetricAlignment(nn.Module):
         loss: RobustLoss | None = None,
         residual: ResidualKind = "channel",
         normalize: bool = False,
-        auto_scale: bool = False,
+        auto_scale: AutoScale = False,
         interpolation: Interpolation = "bilinear",
         max_iterations: int = 30,
         tolerance: float = 1e-4,
@@ -131,13 +138,21 @@ class FeaturemetricAlignment(nn.Module):
             raise ValueError(
                 f"max_iterations must be at least 1 and tolerance not negative, got {max_iterations} and {tolerance}"
             )
+        if auto_scale == "object" and normalize and residual == "channel":
+            raise ValueError(
+                "auto_scale='object' knows no size of single channels of normalised descriptors: use "
+                "residual='norm', or "
+                "normalize=False"
+            )
+        if auto_scale not in (False, True, "object"):
+            raise ValueError(f"auto_scale must be true, false or 'object', got {auto_scale!r}")
         if auto_scale and not isinstance(loss, BarronLoss | Huber):
             raise ValueError(f"auto_scale needs a loss with a scale, got {type(loss).__name__}")
         check_differentiation(differentiation)
         self.loss = loss
         self.residual: ResidualKind = residual
         self.normalize = normalize
-        self.auto_scale = auto_scale
+        self.auto_scale: AutoScale = auto_scale
         self.interpolation: Interpolation = interpolation
         self.max_iterations = max_iterations
         self.tolerance = tolerance
@@ -226,6 +241,12 @@ class FeaturemetricAlignment(nn.Module):
             covariance=_covariance(result.H.detach(), seen[1], seen[2], count, frame),
         )
 
+    def residual_size(self) -> str:
+        """Which of an object's scales is the size of a residual (see ``DescriptorScales``)."""
+        if self.residual == "norm":
+            return "unit" if self.normalize else "match"
+        return "channel"
+
     def _loss_scale(self) -> Tensor | float:
         """c of the loss."""
         assert isinstance(self.loss, BarronLoss | Huber)
@@ -235,6 +256,10 @@ class FeaturemetricAlignment(nn.Module):
         """Factors (n,) that bring residuals to the loss's unit; None without an automatic scale."""
         if not self.auto_scale:
             return None
+        if self.auto_scale == "object":
+            if goal.problem.sizes is None:
+                raise ValueError("auto_scale is 'object': give the problem's sizes, or set it to false")
+            return goal.problem.sizes.to(T_local.dtype).reciprocal()
         with torch.no_grad():
             rows, seen, _ = _residual_rows(T_local, goal, self.interpolation)
             size = rows[:, :, 0].abs()

@@ -1,13 +1,21 @@
 """Visual words, bags of words and template retrieval."""
 
 from foundpose.retrieval.base import QueryPatches, RetrievedTemplates, Retriever, TemplateIndex
-from foundpose.retrieval.bow import IdfMode, SoftAssignBow, WordAssignment, inverse_document_frequency
+from foundpose.retrieval.bow import (
+    BowNormalization,
+    IdfMode,
+    SoftAssignBow,
+    WordAssignment,
+    inverse_document_frequency,
+)
 from foundpose.retrieval.kmeans import KMeansResult, kmeans
 from foundpose.retrieval.retriever import ClsRetriever, TemplateRetriever
+from foundpose.retrieval.spatial import SpatialReranker
 from foundpose.retrieval.votes import PatchVoteRetriever
 from foundpose.retrieval.words import VisualWords
 
 __all__ = [
+    "BowNormalization",
     "ClsRetriever",
     "IdfMode",
     "KMeansResult",
@@ -16,6 +24,7 @@ __all__ = [
     "RetrievedTemplates",
     "Retriever",
     "SoftAssignBow",
+    "SpatialReranker",
     "TemplateIndex",
     "TemplateRetriever",
     "VisualWords",

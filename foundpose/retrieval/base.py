@@ -1,10 +1,13 @@
 """What retrieval receives and returns, and the contract of retrievers."""
 
 from abc import ABC, abstractmethod
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import torch
 from torch import Tensor, nn
+
+if TYPE_CHECKING:  # the representation's own module imports this package
+    from foundpose.onboarding.representation import RepresentationInfo, TemplatePatches
 
 
 class QueryPatches(NamedTuple):
@@ -34,6 +37,7 @@ class TemplateIndex(Protocol):
         descriptors: (M, d) projected descriptors of the patches of all templates, one template after another.
         template_offsets: (T + 1,) int64; template t owns patches ``offsets[t]`` to ``offsets[t + 1]``.
         max_patches: number of patches of the largest template.
+        info: facts, the scales of the descriptors among them.
     """
 
     words: Tensor
@@ -43,6 +47,11 @@ class TemplateIndex(Protocol):
     descriptors: Tensor
     template_offsets: Tensor
     max_patches: int
+    info: "RepresentationInfo"
+
+    def gather_templates(self, index: Tensor, components: int | None = None) -> "TemplatePatches":
+        """Patches of templates, see :meth:`ObjectRepresentation.gather_templates`."""
+        ...
 
 
 class RetrievedTemplates(NamedTuple):

@@ -3,12 +3,16 @@
 A ragged set of patches is a padded (B, P, d) tensor with a (B, P) mask; rows outside the mask count nothing.
 """
 
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor, nn
 
 IdfMode = Literal["document", "occurrence"]
+BowNormalization = Literal["cosine", "hellinger"]
+
+AUTO_SIGMA = 0.4
+"""σ as a share of the patches' median distance from their nearest words, where it is to be measured."""
 
 # Distances to all words exist for one block of patches at a time: 8 M entries, 32 MiB in float32.
 _DISTANCES_PER_BLOCK = 1 << 23
@@ -164,27 +168,59 @@ def tf_idf(counts: Tensor, idf: Tensor) -> Tensor:
     return counts / total.where(total > 0, torch.ones_like(total)) * idf
 
 
+def signed_root(x: Tensor) -> Tensor:
+    """sign(x) √|x|, element by element, as Hellinger's kernel wants it.
+
+    Differentiable w.r.t. ``x``; at zero, where the root's slope is infinite, the gradient is zero.
+    """
+    present = x != 0
+    root = x.abs().where(present, torch.ones_like(x)).sqrt()
+    return torch.where(present, root * x.sign(), torch.zeros_like(x))
+
+
 class SoftAssignBow(nn.Module):
     """Bag-of-words descriptors with soft assignment; templates and queries alike go through it.
 
     Args:
-        sigma: σ of the soft assignment in the unit of the descriptors (10 suits DINOv2).
+        sigma: σ of the soft assignment in the unit of the descriptors (the paper's 10 for DINOv2), or "auto": 0.4
+            of the median distance of the templates' patches from their nearest words, which onboarding measures.
         num_nearest: number of words to which a patch contributes.
+        normalization: what is done to weighted word frequencies before they are compared by their cosine. "cosine":
+            nothing (the paper). "hellinger": (signed) square roots are taken, so that a few frequent words do not
+            outweigh all others.
 
-    Source: paper, "Bag-of-words descriptors"; Philbin et al., CVPR 2008.
+    Source: paper, "Bag-of-words descriptors"; Philbin et al., CVPR 2008; Hellinger: Arandjelović and Zisserman,
+        "Three
+    things everyone should know to improve object retrieval", CVPR 2012.
     """
 
-    def __init__(self, sigma: float = 10.0, num_nearest: int = 3) -> None:
+    def __init__(
+        self,
+        sigma: float | Literal["auto"] = 10.0,
+        num_nearest: int = 3,
+        normalization: BowNormalization = "hellinger",
+    ) -> None:
         super().__init__()
-        if not sigma > 0:
+        if isinstance(sigma, str) and sigma != "auto":
+            raise ValueError(f"sigma must be a number or 'auto', got {sigma!r}")
+        if not isinstance(sigma, str) and not sigma > 0:
             raise ValueError(f"sigma must be positive, got {sigma}")
         if num_nearest < 1:
             raise ValueError(f"num_nearest must be at least 1, got {num_nearest}")
-        self.sigma = sigma
+        if normalization not in get_args(BowNormalization):
+            raise ValueError(
+                f"normalization must be one of {get_args(BowNormalization)}, got {normalization!r}"
+            )
+        self.sigma: float | Literal["auto"] = sigma
         self.num_nearest = num_nearest
+        self.normalization: BowNormalization = normalization
 
-    def assign(self, descriptors: Tensor, valid: Tensor, words: Tensor) -> WordAssignment:
+    def assign(
+        self, descriptors: Tensor, valid: Tensor, words: Tensor, word_distance: float | None = None
+    ) -> WordAssignment:
         """Soft-assign patches (B, P, d) with mask (B, P) to words (k, d); see `assign_words`.
+
+        ``word_distance`` is what an automatic σ is measured by.
 
         Differentiable w.r.t. ``descriptors`` and ``words`` through the weights; the choice of words is constant.
         """
@@ -195,9 +231,23 @@ class SoftAssignBow(nn.Module):
             )
         if words.ndim != 2 or words.shape[1] != descriptors.shape[2] or words.shape[0] < 1:
             raise ValueError(f"words must have shape (k, {descriptors.shape[2]}), got {tuple(words.shape)}")
-        return assign_words(descriptors, valid, words, self.sigma, self.num_nearest)
+        return assign_words(descriptors, valid, words, self._sigma(word_distance), self.num_nearest)
 
-    def forward(self, descriptors: Tensor, valid: Tensor, words: Tensor, idf: Tensor) -> Tensor:
+    def _sigma(self, word_distance: float | None) -> float:
+        if self.sigma != "auto":
+            return self.sigma
+        if word_distance is None:
+            raise ValueError("sigma is auto: give word_distance, or set sigma to a number")
+        return AUTO_SIGMA * word_distance
+
+    def forward(
+        self,
+        descriptors: Tensor,
+        valid: Tensor,
+        words: Tensor,
+        idf: Tensor,
+        word_distance: float | None = None,
+    ) -> Tensor:
         """Describe crops by weighted word frequencies.
 
         Args:
@@ -205,20 +255,29 @@ class SoftAssignBow(nn.Module):
             valid: (B, P) bool.
             words: (k, d) visual words.
             idf: (k,) inverse document frequencies.
+            word_distance: median distance of the templates' patches from their nearest words; for an automatic σ.
 
         Returns:
-            (B, k), not normalised; zeros for a crop without valid patches.
+            (B, k), of any length; zeros for a crop without valid patches.
 
         Raises:
             ValueError: If shapes do not fit.
 
         Differentiable w.r.t. ``descriptors``, ``words`` and ``idf``; which words are nearest is constant.
         """
-        assignment = self.assign(descriptors, valid, words)
+        assignment = self.assign(descriptors, valid, words, word_distance)
         if idf.shape != words.shape[:1]:
             raise ValueError(f"idf must have shape ({words.shape[0]},), got {tuple(idf.shape)}")
-        return tf_idf(word_counts(assignment, words.shape[0]), idf)
+        return self.weigh(word_counts(assignment, words.shape[0]), idf)
+
+    def weigh(self, counts: Tensor, idf: Tensor) -> Tensor:
+        """Bags (B, k) from soft numbers of occurrences (B, k) and inverse document frequencies (k,).
+
+        Differentiable w.r.t. both arguments.
+        """
+        frequencies = tf_idf(counts, idf)
+        return signed_root(frequencies) if self.normalization == "hellinger" else frequencies
 
     def extra_repr(self) -> str:
         """Settings, for printing."""
-        return f"sigma={self.sigma}, num_nearest={self.num_nearest}"
+        return f"sigma={self.sigma}, num_nearest={self.num_nearest}, normalization={self.normalization!r}"

@@ -46,7 +46,8 @@ class TemplateRetriever(Retriever):
             raise ValueError(
                 f"template_bow must have shape (T, {index.words.shape[0]}), got {tuple(index.template_bow.shape)}"
             )
-        vectors = self.bow(query.descriptors, query.valid, index.words, index.idf)
+        distance = index.info.scale("word", "sigma") if self.bow.sigma == "auto" else None
+        vectors = self.bow(query.descriptors, query.valid, index.words, index.idf, distance)
         similarity = normalize_rows(vectors) @ index.template_bow.T
         return select_templates(similarity, query.valid.any(dim=1), self.num_templates)
 

