@@ -259,7 +259,7 @@ class FoundPose(nn.Module):
         if self.start is None:
             return query, templates, found, None
         # Matches that lead back to where they come from count more.
-        trust = torch.where(found.valid, found.priority, -torch.inf).exp()
+        trust = found.valid / (1.0 - found.priority.clamp(min=-1e6) / self.extractor.stride)
         start = self.start(
             found.points_image,
             found.pixels_template,

@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from foundpose import FoundPose, PoseStatus
+from foundpose import FoundPose, PatchVerification, PoseStatus, TemplateStart
 from foundpose.features import CoordinateCode, DinoV2, PatchNoise, PcaProjection
 from foundpose.geometry import (
     PerspectiveCrop,
@@ -517,3 +517,31 @@ def test_gradients_of_a_templates_pose_reach_the_camera(scene, oracle_blob):
     assert torch.isfinite(camera.grad).all()
     # A longer focal length puts the object farther away.
     assert camera.grad[0, 0, 0].abs() > 0
+
+
+def test_starts_and_verification_choose_among_more_hypotheses(blob, oracle_blob):
+    T = torch.stack([pose_at(blob, (300.0 + 20 * k, 230.0), 700.0, k) for k in range(3)])
+    images = torch.stack([render_coordinate_image(CoordinateRenderer(), [blob], [t], K, SIZE) for t in T])
+    masks = CoordinateRenderer()(blob, T, K[None], SIZE).mask
+    coarse = make_pipeline(scorer=PatchVerification(), start=TemplateStart())
+    with torch.no_grad():
+        e = coarse(images, K.expand(3, 3, 3), oracle_blob, masks=masks)
+        # RANSAC that draws one sample finds little; the templates' own poses are enough.
+        poor = RansacPnp(iterations=1)
+        alone = make_pipeline(pnp=poor)(images, K.expand(3, 3, 3), oracle_blob, masks=masks)
+        started = make_pipeline(pnp=poor, start=TemplateStart())(
+            images, K.expand(3, 3, 3), oracle_blob, masks=masks
+        )
+        refined = make_pipeline(
+            scorer=PatchVerification(), start=TemplateStart(), refiner=FeaturemetricRefiner(), refine="all"
+        )(images, K.expand(3, 3, 3), oracle_blob, masks=masks)
+        one = coarse(images[1:2], K[None], oracle_blob, masks=masks[1:2])
+    degrees = torch.rad2deg(rotation_angle(e.T_camera_from_model[:, :3, :3], T[:, :3, :3]))
+    assert (degrees < 3.0).all()
+    assert torch.equal(e.score, e.hypotheses.score.gather(1, e.best[:, None])[:, 0])
+    assert ((e.score > 0.5) & (e.score <= 1)).all()
+    assert (started.num_inliers >= alone.num_inliers).all()
+    assert (started.num_inliers > alone.num_inliers).any()
+    # The scorer compares refined poses, too.
+    assert torch.equal(refined.score, refined.refined.score.amax(1))
+    torch.testing.assert_close(one.T_camera_from_model, e.T_camera_from_model[1:2], atol=1e-2, rtol=1e-4)

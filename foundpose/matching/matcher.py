@@ -17,8 +17,9 @@ from foundpose.matching.soft import (
 
 MatchingMode = Literal["nearest", "cyclic"]
 
-# A cycle that ends so many pixels away counts against a match as much as the largest descriptor distance does.
-_CYCLE_UNIT = 14.0
+# Among matches whose cycles end as far away, those that are trusted sooner lie all over the crop: steps by the golden ratio.
+# (An order by descriptor distance would hang on the last digit.)
+_GOLDEN = 0.6180339887498949
 
 # Distances between all patches exist for one block of (crop, template) pairs at a time: 64 MiB in float32.
 _DISTANCES_PER_BLOCK = 1 << 24
@@ -125,8 +126,8 @@ def match_patches(
         )
         if top_k is not None:
             ok = keep_best(ok, cycle if mode == "cyclic" else None, length, top_k)
-        largest = length.detach().masked_fill(~ok, 0.0).amax(dim=-1, keepdim=True)
-        priority = -cycle / _CYCLE_UNIT - length.detach() / largest.where(largest > 0, 1.0)
+        spread = (torch.arange(P, device=query.device, dtype=torch.float64) * _GOLDEN).frac()
+        priority = -cycle - spread.to(cycle)
         chosen = x.gather(1, forth.unsqueeze(-1).expand(-1, -1, 3))
         if temperature is None:
             weight = torch.ones_like(length)

@@ -6,13 +6,15 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from torch import Tensor
 
 from foundpose.estimates import PoseEstimates, PoseStatus
+from foundpose.geometry import project_points, transform_points
 from foundpose.io import write_atomically
 from foundpose.onboarding import ObjectRepresentation
 from foundpose.rendering import Mesh, Renderer
-from foundpose.visualization.overlay import COARSE, REFINED, TRUTH, draw_axes, draw_contour
+from foundpose.visualization.overlay import COARSE, REFINED, TRUTH, Color, draw_axes, draw_contour
 
 _MOST_LINES = 60
 _MOST_TEMPLATES = 7
@@ -50,7 +52,7 @@ def save_estimate_figure(
     renderer: Renderer,
     T_true: Tensor | None = None,
 ) -> None:
-    """Write a figure: pose on the picture, crop, retrieved templates, matches of the best template.
+    """Write a figure: pose on the picture and closer, crop, retrieved templates, matches of the best template.
 
     Args:
         path: a picture file.
@@ -76,18 +78,27 @@ def save_estimate_figure(
     status = PoseStatus(int(e.status[index]))
 
     figure = Figure(figsize=(14, 11), layout="constrained")
-    grid = figure.add_gridspec(3, 1, height_ratios=[5, 2.6, 5])
+    grid = figure.add_gridspec(3, 1, height_ratios=[5.3, 2.6, 5])
     top, middle, bottom = (figure.add_subfigure(grid[row, 0]) for row in range(3))
-    left, right = top.subplots(1, 2, width_ratios=[image.shape[2] / image.shape[1], 1])
+    left, middle_top, right = top.subplots(1, 3, width_ratios=[image.shape[2] / image.shape[1], 1, 1])
     drawn = image
     if bool(e.valid[index]):
+        coarse = e.T_coarse[index].cpu()
         refined = None if e.refined is None else e.T_camera_from_model[index].cpu()
-        drawn = overlay_pose(image, K, mesh, renderer, e.T_coarse[index].cpu(), refined, T_true)
+        drawn = overlay_pose(image, K, mesh, renderer, coarse, refined, T_true)
+        shown_poses = [("truth", TRUTH, T_true), ("coarse", COARSE, coarse), ("refined", REFINED, refined)]
+        _explain(middle_top, [(name, color) for name, color, T in shown_poses if T is not None])
     _show(left, drawn, f"{representation.info.name}: {status.name}, {int(e.num_inliers[index])} inliers")
+    _show(middle_top, drawn, "the same, closer (axes of the model: x red, y green, z blue)")
+    if bool(e.valid[index]):
+        _look_closer(middle_top, K, mesh, [T for _, _, T in shown_poses if T is not None])
     crop = draw_contour(
         e.crops.images[index].cpu(), e.crops.masks[index].cpu() > 0.5, (1.0, 1.0, 1.0), width=1
     )
-    _show(right, crop, "crop and mask")
+    _show(right, crop, "crop, outline of the mask white")
+    middle.suptitle(
+        "retrieved templates: similarity of their visual words, inliers of their poses", fontsize=9
+    )
     shown = sorted({*range(min(len(templates), _MOST_TEMPLATES)), best})
     for rank, axes in zip(shown, middle.subplots(1, len(shown), squeeze=False)[0], strict=True):
         inliers = int(e.hypotheses.num_inliers[index, rank])
@@ -95,6 +106,23 @@ def save_estimate_figure(
         _show(axes, views[rank], f"{similarity:.2f}, {inliers} inliers" + (" (best)" if rank == best else ""))
     _show_matches(bottom.subplots(1, 1), estimates, index, best, views[best])
     write_atomically(Path(path), lambda temporary: figure.savefig(temporary, dpi=70))
+
+
+def _explain(axes: Axes, contours: list[tuple[str, Color]]) -> None:
+    """Say which contour is which."""
+    lines = [Line2D([], [], color=color, linewidth=3, label=name) for name, color in contours]
+    axes.legend(handles=lines, loc="upper right", fontsize=9, framealpha=0.8)
+
+
+def _look_closer(axes: Axes, K: Tensor, mesh: Mesh, poses: list[Tensor]) -> None:
+    """Show of a picture only the square in which an object lies under its poses."""
+    pixels = torch.cat(
+        [project_points(transform_points(T.float(), mesh.vertices), K.float().cpu())[0] for T in poses]
+    )
+    low, high = pixels.amin(dim=0), pixels.amax(dim=0)
+    (u, v), half = ((low + high) / 2).tolist(), 0.6 * float((high - low).max())
+    axes.set_xlim(u - half, u + half)
+    axes.set_ylim(v + half, v - half)
 
 
 def _show_matches(axes: Axes, e: PoseEstimates, index: int, best: int, template: Tensor) -> None:

@@ -31,7 +31,7 @@ def brute_force(inputs: Problem, cyclic: bool, top_k: int | None) -> Matches:
     B, h, _, _ = template.shape
     P = query.shape[1]
     index, distance = np.zeros((B, h, P), dtype=int), np.full((B, h, P), np.inf)
-    matched = np.zeros((B, h, P, 3))
+    matched, priority = np.zeros((B, h, P, 3)), np.full((B, h, P), -np.inf)
     for b in range(B):
         for t in range(h):
             rows, columns = np.flatnonzero(query_valid[b]), np.flatnonzero(template_valid[b, t])
@@ -40,14 +40,16 @@ def brute_force(inputs: Problem, cyclic: bool, top_k: int | None) -> Matches:
             D = np.linalg.norm(query[b, rows][:, None] - template[b, t, columns][None], axis=-1)
             forth = D.argmin(1)
             back = D.argmin(0)[forth]
-            cycle = np.linalg.norm(pixels[b, rows] - pixels[b, rows[back]], axis=-1) * cyclic
+            cycle = np.linalg.norm(pixels[b, rows] - pixels[b, rows[back]], axis=-1)
             best = D[np.arange(len(rows)), forth]
-            kept = sorted(range(len(rows)), key=lambda i: (cycle[i], best[i], i))[:top_k]
+            kept = sorted(range(len(rows)), key=lambda i: (cycle[i] * cyclic, best[i], i))[:top_k]
+            priority[b, t, rows[kept]] = -cycle[kept] - (rows[kept] * 0.6180339887498949) % 1.0
             index[b, t, rows[kept]] = columns[forth[kept]]
             distance[b, t, rows[kept]] = best[kept]
             matched[b, t, rows[kept]] = points[b, t, columns[forth[kept]]]
     valid = np.isfinite(distance)
-    return Matches(*(torch.from_numpy(x) for x in (index, distance, valid, matched, valid.astype(float))))
+    fields = (index, distance, valid, matched, valid.astype(float), priority)
+    return Matches(*(torch.from_numpy(x) for x in fields))
 
 
 def assert_same(got: Matches, expected: Matches) -> None:
@@ -64,7 +66,9 @@ def test_equals_brute_force(mode: str, top_k: int | None) -> None:
     inputs[1][1] = False  # a crop without patches
     inputs[3][2, 1] = False  # a template without patches
     got = PatchMatcher(mode, top_k)(*inputs)
-    assert_same(got, brute_force(inputs, mode == "cyclic", top_k))
+    expected = brute_force(inputs, mode == "cyclic", top_k)
+    assert_same(got, expected)
+    torch.testing.assert_close(got.priority, expected.priority)
     assert not got.valid[1].any()
     assert not got.valid[2, 1].any()
 

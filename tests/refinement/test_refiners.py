@@ -185,3 +185,81 @@ def test_nearest_templates(oracle_blob):
     moved = T[pick].clone()
     moved[:, :3, 3] *= 1.4  # the same view from farther away
     assert torch.equal(nearest_templates(moved, T), pick)
+
+
+def recorded_problem(pipeline, *args, **kwargs):
+    """The alignment problem that a pipeline's refiner is given, and the poses that it starts from."""
+    seen = []
+    pipeline.refiner.alignment.register_forward_pre_hook(lambda _, inputs: seen.append(inputs))
+    with torch.no_grad():
+        estimates = pipeline(*args, **kwargs)
+    return estimates, *seen[0]
+
+
+def test_views_near_the_pose_take_the_templates_place(views, oracle_blob):
+    images, masks, T_true = views
+    refiner = FeaturemetricRefiner(oracle_refiner().alignment, num_views=3)
+    pipeline = make_pipeline(refiner=refiner)
+    e, T, problem = recorded_problem(pipeline, images, K.expand(6, 3, 3), oracle_blob, masks=masks)
+    nearest = oracle_blob.nearest_views(T, 3)
+    for row in range(6):
+        angle = rotation_angle(T[row, :3, :3].expand(100, 3, 3), oracle_blob.T_template_from_model[:, :3, :3])
+        assert set(nearest[row].tolist()) == set(angle.argsort()[:3].tolist())
+    counts = oracle_blob.template_offsets.diff()[nearest].sum(1)
+    assert torch.equal(problem.valid.sum(1), counts)
+    before, after = angles(e.T_coarse, T_true), angles(e.T_camera_from_model, T_true)
+    assert after.median() < before.median()
+
+
+def test_patches_off_the_mask_are_left_out(views, oracle_blob):
+    images, masks, _ = views
+    half = masks.clone()
+    half[:, :, : masks.shape[2] // 2] = False
+    half[half.flatten(1).sum(1) < 500] = masks[half.flatten(1).sum(1) < 500]
+    for margin in (0.0, 7.0):
+        refiner = FeaturemetricRefiner(oracle_refiner().alignment, mask_margin=margin)
+        e, T, problem = recorded_problem(
+            make_pipeline(refiner=refiner), images, K.expand(6, 3, 3), oracle_blob, masks=half
+        )
+        _, _, whole = recorded_problem(
+            make_pipeline(refiner=oracle_refiner()), images, K.expand(6, 3, 3), oracle_blob, masks=half
+        )
+        kept, checked = 0, 0
+        for row in range(6):
+            inside = (e.crops.masks[row] > 0.5).nonzero().flip(1).float()
+            for p in range(0, whole.valid.shape[1], 7):
+                if not whole.valid[row, p]:
+                    assert not problem.valid[row, p]
+                    continue
+                x = T[row, :3, :3] @ whole.points_model[row, p] + T[row, :3, 3]
+                u = (problem.K[row] @ x)[:2] / x[2]
+                away = float((inside - u).abs().amax(1).min()) - margin
+                if abs(away - 0.5) > 0.6:  # not at the very edge of a pixel
+                    assert bool(problem.valid[row, p]) == (away < 0.5)
+                    kept, checked = kept + int(away < 0.5), checked + 1
+        assert 0 < kept < checked
+
+
+def test_bad_settings_of_the_refiner():
+    with pytest.raises(ValueError, match="num_views must be at least 1 or None, got 0"):
+        FeaturemetricRefiner(num_views=0)
+    with pytest.raises(ValueError, match="mask_margin must not be negative"):
+        FeaturemetricRefiner(mask_margin=-1.0)
+
+
+def test_the_loss_can_be_measured_by_the_object(views, oracle_blob):
+    images, masks, _ = views
+    size = oracle_blob.info.scales["match"]
+    refiners = [
+        FeaturemetricRefiner(
+            FeaturemetricAlignment(BarronLoss(-5.0, scale), residual="norm", auto_scale=auto, tolerance=1e-6)
+        )
+        for scale, auto in ((1.0, "object"), (size, False))
+    ]
+    with torch.no_grad():
+        measured, fixed = (
+            make_pipeline(refiner=r)(images, K.expand(6, 3, 3), oracle_blob, masks=masks) for r in refiners
+        )
+    torch.testing.assert_close(measured.T_camera_from_model, fixed.T_camera_from_model, atol=0.05, rtol=1e-3)
+    with pytest.raises(ValueError, match="knows no size of single channels"):
+        FeaturemetricAlignment(auto_scale="object", normalize=True)

@@ -15,6 +15,7 @@ from foundpose.retrieval.bow import (
     assign_words,
     inverse_document_frequency,
     nearest_words,
+    signed_root,
     tf_idf,
     word_counts,
 )
@@ -55,12 +56,45 @@ def brute_force(
 def test_equals_brute_force(dtype: torch.dtype, tolerance: float) -> None:
     x, valid, words = crops(5, 40, 70, 8, dtype)
     idf = torch.rand(70, generator=torch.Generator().manual_seed(1), dtype=dtype)
-    got = SoftAssignBow(sigma=1.3, num_nearest=3)(x, valid, words, idf)
+    got = SoftAssignBow(sigma=1.3, num_nearest=3, normalization="cosine")(x, valid, words, idf)
     expected = brute_force(
         x.double().numpy(), valid.numpy(), words.double().numpy(), idf.double().numpy(), 1.3, 3
     )
     assert got.dtype == dtype
     torch.testing.assert_close(got.double(), torch.from_numpy(expected), atol=tolerance, rtol=tolerance)
+
+
+def test_hellinger_takes_signed_roots_of_the_formula() -> None:
+    x, valid, words = crops(5, 40, 70, 8)
+    idf = torch.randn(70, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    expected = brute_force(x.numpy(), valid.numpy(), words.numpy(), idf.numpy(), 1.3, 3)
+    got = SoftAssignBow(1.3, 3, "hellinger")(x, valid, words, idf)
+    expected = np.sign(expected) * np.sqrt(np.abs(expected))
+    torch.testing.assert_close(got, torch.from_numpy(expected), atol=1e-9, rtol=1e-9)
+
+
+def test_hellingers_cosine_is_the_affinity_of_distributions() -> None:
+    counts = torch.rand(2, 30, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    bags = SoftAssignBow(1.0).weigh(counts, torch.ones(30).double())
+    p, q = counts / counts.sum(dim=1, keepdim=True)
+    torch.testing.assert_close(torch.cosine_similarity(bags[:1], bags[1:])[0], (p * q).sqrt().sum())
+
+
+def test_a_root_of_nothing_has_no_gradient() -> None:
+    x = torch.tensor([0.0, 4.0, -9.0], dtype=torch.float64, requires_grad=True)
+    root = signed_root(x)
+    assert root.tolist() == [0.0, 2.0, -3.0]
+    (gradient,) = torch.autograd.grad(root.sum(), x)
+    torch.testing.assert_close(gradient, torch.tensor([0.0, 1 / 4, 1 / 6]).double())
+
+
+def test_an_automatic_sigma_follows_the_words() -> None:
+    x, valid, words = crops(5, 40, 70, 8)
+    idf = torch.ones(70).double()
+    auto = SoftAssignBow("auto")
+    assert torch.equal(auto(x, valid, words, idf, 2.0), SoftAssignBow(0.8)(x, valid, words, idf))
+    with pytest.raises(ValueError, match="sigma is auto: give word_distance"):
+        auto(x, valid, words, idf)
 
 
 def test_nearest_words_equal_sklearn() -> None:
@@ -225,3 +259,7 @@ def test_bad_input() -> None:
         SoftAssignBow(sigma=0)
     with pytest.raises(ValueError, match="num_nearest must be at least 1, got 0"):
         SoftAssignBow(num_nearest=0)
+    with pytest.raises(ValueError, match="got 'l1'"):
+        SoftAssignBow(normalization="l1")
+    with pytest.raises(ValueError, match="sigma must be a number or 'auto', got 'wide'"):
+        SoftAssignBow(sigma="wide")

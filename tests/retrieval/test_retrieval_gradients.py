@@ -21,7 +21,7 @@ from foundpose.retrieval.bow import (
 from foundpose.retrieval.retriever import TemplateRetriever, normalize_rows, select_templates
 
 CROPS, PATCHES, WORDS, CHANNELS, TEMPLATES = 3, 6, 7, 4, 5
-BOW = SoftAssignBow(sigma=1.0, num_nearest=3)
+BOW = SoftAssignBow(sigma=1.0, num_nearest=3, normalization="cosine")
 
 
 class Index(NamedTuple):

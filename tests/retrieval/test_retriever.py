@@ -22,7 +22,7 @@ class Index(NamedTuple):
     template_bow: Tensor
 
 
-BOW = SoftAssignBow(sigma=1.0, num_nearest=3)
+BOW = SoftAssignBow(sigma=1.0, num_nearest=3, normalization="cosine")
 
 
 def templates(count: int, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor, Index]:
