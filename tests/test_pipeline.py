@@ -527,7 +527,7 @@ def test_starts_and_verification_choose_among_more_hypotheses(blob, oracle_blob)
     with torch.no_grad():
         e = coarse(images, K.expand(3, 3, 3), oracle_blob, masks=masks)
         # RANSAC that draws one sample finds little; the templates' own poses are enough.
-        poor = RansacPnp(iterations=1)
+        poor = RansacPnp(iterations=1, polish_rounds=0)
         alone = make_pipeline(pnp=poor)(images, K.expand(3, 3, 3), oracle_blob, masks=masks)
         started = make_pipeline(pnp=poor, start=TemplateStart())(
             images, K.expand(3, 3, 3), oracle_blob, masks=masks

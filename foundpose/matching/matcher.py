@@ -17,8 +17,8 @@ from foundpose.matching.soft import (
 
 MatchingMode = Literal["nearest", "cyclic"]
 
-# Among matches whose cycles end as far away, those that are trusted sooner lie all over the crop: steps by the golden ratio.
-# (An order by descriptor distance would hang on the last digit.)
+# Among matches whose cycles end as far away, those that are trusted sooner lie all over the crop: steps by the golden
+# ratio. (An order by descriptor distance would hang on the last digit.)
 _GOLDEN = 0.6180339887498949
 
 # Distances between all patches exist for one block of (crop, template) pairs at a time: 64 MiB in float32.

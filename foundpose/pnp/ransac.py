@@ -117,7 +117,7 @@ class RansacPnp(nn.Module):
         seed: int = 0,
         score_points: int | None = 128,
         chunk: int | None = None,
-        guidance: float = 2.0,
+        guidance: float = 1.0,
     ) -> None:
         super().__init__()
         check_solver(solver)
@@ -343,14 +343,15 @@ class RansacPnp(nn.Module):
         usable: Tensor,
         priority: Tensor | None,
     ) -> Hypotheses:
+        guide = priority.detach() if priority is not None and self.guidance > 1.0 else None
         return sample_hypotheses(
             points_image.detach(),
             points_model.detach(),
             K.detach(),
             valid,
             usable,
-            self.draws if priority is None else self.guided_draws,
-            priority=None if priority is None else priority.detach(),
+            self.draws if guide is None else self.guided_draws,
+            priority=guide,
             solver=self.solver,
             threshold=self.threshold,
             confidence=self.confidence,
