@@ -96,9 +96,7 @@ def save_estimate_figure(
         e.crops.images[index].cpu(), e.crops.masks[index].cpu() > 0.5, (1.0, 1.0, 1.0), width=1
     )
     _show(right, crop, "crop, outline of the mask white")
-    middle.suptitle(
-        "retrieved templates: similarity of their visual words, inliers of their poses", fontsize=9
-    )
+    middle.suptitle("retrieved templates: their similarity, and inliers of their poses", fontsize=9)
     shown = sorted({*range(min(len(templates), _MOST_TEMPLATES)), best})
     for rank, axes in zip(shown, middle.subplots(1, len(shown), squeeze=False)[0], strict=True):
         inliers = int(e.hypotheses.num_inliers[index, rank])
