@@ -1,3 +1,4 @@
+import ctypes
 import sys
 
 import pytest
@@ -23,6 +24,9 @@ def test_peak_memory_is_what_a_run_allocates(device):
         torch.ones(samples * 40 * MIB, dtype=torch.uint8, device=device)
 
     run(1)
+    if device == "cpu":
+        # Memory that other tests have freed, but the allocator holds, would be used without the process growing.
+        ctypes.CDLL(None).malloc_trim(0)
     for samples in (1, 3):
         assert peak_memory(run, samples, torch.device(device)) / MIB == pytest.approx(40 * samples, abs=10)
     assert peak_memory(lambda _: None, 1, torch.device(device)) < 10 * MIB

@@ -129,7 +129,7 @@ def test_defaults_are_the_papers():
     assert (cfg.pnp.solver, cfg.pnp.mirror, cfg.pnp.guidance) == ("p3p", True, 2.0)
     assert (cfg.bow.normalization, cfg.crop.background) == ("hellinger", "black")
     paper = load("config", "experiment=paper")
-    own = ["pnp=epnp_ransac", "pnp.guidance=1.0", "retrieval=bag_of_words", "start=none", "scorer=inliers"]
+    own = ["pnp=epnp_ransac", "retrieval=bag_of_words", "start=none", "scorer=inliers"]
     assert load("config", *own, "bow.normalization=cosine", "crop.background=keep") == paper
     assert (cfg.extractor.variant, cfg.extractor.layer, cfg.sigma) == ("vitl14_reg", 18, 10.0)
     assert (cfg.crop.size, cfg.crop.fill, cfg.viewpoints.count) == (420, 0.6, 800)
@@ -156,7 +156,7 @@ DELIBERATE = {
     ("matcher", "soft"): {"temperature"},
     ("pnp", "p3p_ransac"): {"guidance"},
     ("pnp", "soft_ransac"): {"guidance"},
-    ("pnp", "epnp_ransac"): {"solver", "mirror", "guidance"},
+    ("pnp", "epnp_ransac"): {"solver", "mirror"},
     ("robust_loss", "huber"): {"scale"},
     ("robust_loss", "barron"): {"scale"},
     ("crop", "perspective"): {"background"},

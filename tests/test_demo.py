@@ -90,7 +90,7 @@ def test_procedural_is_what_it_was():
     assert (cfg.crop.background, cfg.viewpoints.count, cfg.words.num_words) == ("keep", 300, 1024)
     assert (cfg.max_rotation, cfg.max_translation) == (10.0, 0.1)
     assert cfg.refiner._target_.endswith("FeaturemetricRefiner")
-    photograph = load()
+    photograph = load("extractor=dinov2_vits14_wheel")
     assert (photograph.crop.background, photograph.max_rotation, photograph.max_translation) == (
         "black",
         15.0,

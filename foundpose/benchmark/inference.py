@@ -17,7 +17,7 @@ from foundpose.matching import PatchMatcher, SoftPatchMatcher
 from foundpose.pipeline import FoundPose, select_query_patches
 from foundpose.pnp import RansacPnp, TemplateStart, TopTemplatePose
 from foundpose.refinement import PoseRefiner
-from foundpose.retrieval import Retriever, TemplateRetriever
+from foundpose.retrieval import Retriever, SpatialReranker, TemplateRetriever
 from foundpose.verification import HypothesisScorer
 
 Refine = Literal["best", "all"]
@@ -185,15 +185,21 @@ def stage_tasks(
         task("query patches", partial(select_query_patches, features, coarse.crops, scripted)),
         task("PCA projection", partial(representation.projection, raw.descriptors)),
     ]
-    if isinstance(stages.retriever, TemplateRetriever):
+    retriever = stages.retriever
+    if isinstance(retriever, SpatialReranker):
+        retriever = retriever.retriever
+    if isinstance(retriever, TemplateRetriever):
         call = partial(
-            stages.retriever.bow,
+            retriever.bow,
             coarse.query.descriptors,
             coarse.query.valid,
             representation.words,
             representation.idf,
         )
         tasks.append(task("words and bag of words", call, note="a part of retrieval"))
+    if retriever is not stages.retriever:
+        candidates = partial(retriever, *inputs["retriever"])
+        tasks.append(task("candidates for re-ranking", candidates, note="a part of retrieval"))
     tasks.append(task("retrieval", partial(stages.retriever, *inputs["retriever"])))
     if isinstance(stages.pnp, RansacPnp):
         tasks += [
@@ -272,7 +278,7 @@ def backward_tasks(
         tasks.append(task(f"{name}, w.r.t. images", partial(_gradient, describe, [crops])))
     if isinstance(stages.pnp, RansacPnp):
         soft = SoftPatchMatcher(5.0).to(crops.device)
-        query, query_valid, template, template_valid, pixels, points = inputs["matcher"]
+        query, query_valid, template, template_valid, pixels, points = inputs["matcher"][:6]
         query, template = _leaf(query), _leaf(template)
 
         def match() -> Tensor:
@@ -281,12 +287,12 @@ def backward_tasks(
         tasks.append(
             task("soft matching, w.r.t. both descriptors", partial(_gradient, match, [query, template]))
         )
-        points_image, points_model, K, valid, weights = inputs["pnp"]
+        points_image, points_model, K, valid, weights, priority = inputs["pnp"]
         leaves = [_leaf(points_image), _leaf(points_model), _leaf(weights)]
         pnp = stages.pnp
 
         def solve() -> Tensor:
-            return pnp(leaves[0], leaves[1], K, valid, leaves[2]).T_camera_from_model
+            return pnp(leaves[0], leaves[1], K, valid, leaves[2], priority).T_camera_from_model
 
         tasks.append(task(f"{pnp_name(h)}, w.r.t. points and weights", partial(_gradient, solve, leaves)))
     if stages.refiner is not None:

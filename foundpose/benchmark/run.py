@@ -117,6 +117,9 @@ def make_stages(
     cfg.crop.size, cfg.crop.fill = sizes.crop_size, sizes.fill
     alignments = ("refiner.alignment", "refiners.featuremetric.alignment")
     _set_where_known(cfg, "retrieval.num_templates", hypotheses or cfg.hypotheses)
+    candidates = OmegaConf.select(cfg, "retrieval.retriever.num_templates")
+    if candidates is not None:  # of which re-ranking keeps the templates
+        cfg.retrieval.retriever.num_templates = max(candidates, hypotheses or cfg.hypotheses)
     _set_where_known(cfg, "pnp.iterations", ransac_iterations or cfg.ransac_iterations)
     for node in alignments:
         _set_where_known(cfg, f"{node}.max_iterations", lm_iterations or cfg.lm_iterations)

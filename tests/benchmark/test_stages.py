@@ -97,7 +97,8 @@ def test_stages_run_on_what_the_pipeline_hands_them(stages, workload):
             stages.pipeline(ScriptedExtractor(workload.sizes, workload.features), "all"), workload
         )
     assert list(tasks) == [
-        *("backbone", "crop", "query patches", "PCA projection", "words and bag of words", "retrieval"),
+        *("backbone", "crop", "query patches", "PCA projection", "words and bag of words"),
+        *("candidates for re-ranking", "retrieval"),
         *("template gather", "matching", "PnP of 5 hypotheses", "PnP of 5 hypotheses, epnp"),
         *(REFINE_ONE, "refinement of 5 hypotheses"),
     ]
@@ -108,7 +109,9 @@ def test_stages_run_on_what_the_pipeline_hands_them(stages, workload):
     assert torch.equal(results["matching"].distance, whole.correspondences.distance)
     pnp = results["PnP of 5 hypotheses"]
     assert isinstance(pnp, PnpResult)
-    assert torch.equal(pnp.num_inliers.reshape(2, 5), whole.hypotheses.num_inliers)
+    # The pipeline keeps the better of RANSAC's pose and the template's own.
+    ransac = stages._replace(start=None).pipeline(ScriptedExtractor(workload.sizes, workload.features), "all")
+    assert torch.equal(pnp.num_inliers.reshape(2, 5), estimate(ransac, workload).hypotheses.num_inliers)
     refined = results["refinement of 5 hypotheses"]
     assert whole.refined is not None
     assert torch.equal(refined.T_crop_from_model, whole.refined.T_crop_from_model)

@@ -124,7 +124,8 @@ def test_tokens_land_on_the_patch_centres(make_extractor, size) -> None:
     centers = extractor.patch_centers(420, found.device, found.dtype).permute(2, 0, 1)
     # at the border enlarging repeats the outermost pixels, which moves the outermost tokens by 0.01 px
     torch.testing.assert_close(found, centers, atol=0.03, rtol=0)
-    torch.testing.assert_close(found[:, 2:-2, 2:-2], centers[:, 2:-2, 2:-2], atol=2e-3, rtol=0)
+    # coordinates up to 420 px through products in single precision: some 1e-5 of them, as the machine sums
+    torch.testing.assert_close(found[:, 2:-2, 2:-2], centers[:, 2:-2, 2:-2], atol=4e-3, rtol=0)
 
 
 @pytest.mark.parametrize("name", ["loftr", "loftr_fine"])
