@@ -44,27 +44,7 @@ def fit_similarity(source: Tensor, target: Tensor, weight: Tensor, motion: InPla
     Differentiable w.r.t. all tensors.
     Source: Umeyama, "Least-squares estimation of transformation parameters", 1991, in the plane.
     """
-    share = weight / weight.sum(dim=-1, keepdim=True).clamp(min=torch.finfo(weight.dtype).tiny)
-    from_mean = (share.unsqueeze(-1) * source).sum(dim=-2)
-    to_mean = (share.unsqueeze(-1) * target).sum(dim=-2)
-    x, y = source - from_mean.unsqueeze(-2), target - to_mean.unsqueeze(-2)
-    spread = (share * x.square().sum(dim=-1)).sum(dim=-1)
-    cosine = (share * (x * y).sum(dim=-1)).sum(dim=-1)
-    sine = (share * (x[..., 0] * y[..., 1] - x[..., 1] * y[..., 0])).sum(dim=-1)
-    if motion != "similarity":
-        sine = torch.zeros_like(sine)
-    known = (spread > 0) & (cosine.square() + sine.square() > 0)
-    spread = spread.where(known, torch.ones_like(spread))
-    cosine = torch.where(known, cosine / spread, torch.ones_like(cosine))
-    sine = torch.where(known, sine / spread, torch.zeros_like(sine))
-    scale = torch.sqrt(cosine.square() + sine.square())
-    factor = scale.clamp(_SMALLEST_SCALE, _LARGEST_SCALE) / scale
-    if motion == "shift":
-        cosine, factor = torch.ones_like(cosine), torch.ones_like(factor)
-    a, b = cosine * factor, sine * factor
-    linear = torch.stack([torch.stack([a, -b], dim=-1), torch.stack([b, a], dim=-1)], dim=-2)
-    shift = to_mean - (linear @ from_mean.unsqueeze(-1)).squeeze(-1)
-    return torch.cat([linear, shift.unsqueeze(-1)], dim=-1)
+    return _fit(*(points.transpose(-1, -2).contiguous() for points in (source, target)), weight, motion)
 
 
 def fit_similarity_robustly(
@@ -89,7 +69,33 @@ def fit_similarity_robustly(
     Differentiable w.r.t. all tensors.
     """
     A = identity_similarity(source) if start is None else start
+    source, target = (points.transpose(-1, -2).contiguous() for points in (source, target))
     for scale in scales:
-        squared = (apply_similarity(A, source) - target).square().sum(dim=-1)
-        A = fit_similarity(source, target, weight / (1.0 + squared / scale**2), motion)
+        squared = (A[..., :2] @ source + A[..., 2:] - target).square().sum(dim=-2)
+        A = _fit(source, target, weight / (1.0 + squared / scale**2), motion)
     return A
+
+
+def _fit(source: Tensor, target: Tensor, weight: Tensor, motion: InPlane) -> Tensor:
+    """:func:`fit_similarity` of points (..., 2, N): sums run along memory."""
+    share = weight / weight.sum(dim=-1, keepdim=True).clamp(min=torch.finfo(weight.dtype).tiny)
+    share = share.unsqueeze(-2)
+    from_mean, to_mean = ((share * points).sum(dim=-1, keepdim=True) for points in (source, target))
+    x, y = source - from_mean, target - to_mean
+    weighted = share * x
+    spread = (weighted * x).sum(dim=(-2, -1))
+    cosine = (weighted * y).sum(dim=(-2, -1))
+    sine = (weighted[..., 0, :] * y[..., 1, :] - weighted[..., 1, :] * y[..., 0, :]).sum(dim=-1)
+    if motion != "similarity":
+        sine = torch.zeros_like(sine)
+    known = (spread > 0) & (cosine.square() + sine.square() > 0)
+    spread = spread.where(known, torch.ones_like(spread))
+    cosine = torch.where(known, cosine / spread, torch.ones_like(cosine))
+    sine = torch.where(known, sine / spread, torch.zeros_like(sine))
+    scale = torch.sqrt(cosine.square() + sine.square())
+    factor = scale.clamp(_SMALLEST_SCALE, _LARGEST_SCALE) / scale
+    if motion == "shift":
+        cosine, factor = torch.ones_like(cosine), torch.ones_like(factor)
+    a, b = cosine * factor, sine * factor
+    linear = torch.stack([torch.stack([a, -b], dim=-1), torch.stack([b, a], dim=-1)], dim=-2)
+    return torch.cat([linear, to_mean - linear @ from_mean], dim=-1)

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor, nn
 
 from foundpose.geometry.cameras import axis_rotation_to_ray, pixel_rays
-from foundpose.geometry.similarity import fit_similarity_robustly
+from foundpose.geometry.similarity import apply_similarity, fit_similarity_robustly
 from foundpose.geometry.transforms import make_transform
 
 # Distances in pixels at which a match counts a half, in each fit: templates and crops are framed alike, so right
@@ -68,7 +68,7 @@ def weak_perspective_poses(
     in_template = R @ centre + t
     image = K @ in_template.unsqueeze(-1)
     pixel = (image[..., :2, 0] / image[..., 2:, 0]).unsqueeze(-2)
-    moved = pixel @ A[..., :2].transpose(-1, -2) + A[..., None, :, 2]
+    moved = apply_similarity(A, pixel)
     scale = torch.linalg.vector_norm(A[..., 0, :2], dim=-1)
     cosine, sine = A[..., 0, 0] / scale, A[..., 1, 0] / scale
     zero, one = torch.zeros_like(sine), torch.ones_like(sine)

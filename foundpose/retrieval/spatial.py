@@ -5,12 +5,7 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
-from foundpose.geometry.similarity import (
-    InPlane,
-    apply_similarity,
-    fit_similarity_robustly,
-    identity_similarity,
-)
+from foundpose.geometry.similarity import InPlane, fit_similarity_robustly, identity_similarity
 from foundpose.retrieval.base import (
     QueryPatches,
     RetrievedTemplates,
@@ -21,12 +16,18 @@ from foundpose.retrieval.base import (
 
 Alignment = Literal["none"] | InPlane
 
-# What a cell of distance costs while template and crop are brought together, before it costs ``position_weight``.
-_EARLY_WEIGHTS = (0.25, 0.5)
+# What a cell of distance costs while template and crop are brought together, as shares of ``position_weight``: of the
+# squared distance, over this many cells, which one matrix product gives for all pairs.
+_ALIGNMENT_WEIGHTS = (0.25, 0.5, 1.0)
+_ALIGNMENT_CELLS = 4.0
 # Distances in cells at which a pair of patches counts a half, in each fit.
-_FIT_SCALES = (2.0, 1.5, 1.5)
-# Similarities of a patch with all patches of all candidates exist for a few crops at a time: 16 MiB in float32.
-_SIMILARITIES_PER_BLOCK = 1 << 22
+_FIT_SCALES = (2.0, 1.5)
+# So many of the crop's patches align it with a template.
+_ALIGNMENT_PATCHES = 32
+# Similarities of a patch with all patches of all candidates exist for a few crops at a time: what a cache holds.
+_SIMILARITIES_PER_BLOCK = 1 << 21
+# Where padding lies, in cells: it is never the nearest.
+_FAR_AWAY = 1e4
 
 
 class SpatialReranker(Retriever):
@@ -57,7 +58,7 @@ class SpatialReranker(Retriever):
         num_templates: int = 5,
         position_weight: float = 0.2,
         alignment: Alignment = "similarity",
-        max_patches: int | None = 96,
+        max_patches: int | None = 64,
         components: int | None = 64,
     ) -> None:
         super().__init__(num_templates)
@@ -72,8 +73,7 @@ class SpatialReranker(Retriever):
         if retriever.num_templates < num_templates:
             raise ValueError(
                 f"the retriever finds {retriever.num_templates} candidates, of which {num_templates} templates "
-                f"cannot "
-                "be kept: raise its num_templates"
+                "cannot be kept: raise its num_templates"
             )
         self.retriever = retriever
         self.position_weight = position_weight
@@ -119,36 +119,43 @@ class SpatialReranker(Retriever):
         valid = query.valid[rows]
         patches = index.gather_templates(candidates.index[rows], self.components)
         x = query.descriptors[rows, :, : self.components].masked_fill(~valid.unsqueeze(-1), 0.0)
-        x = normalize_rows(x)
-        cosine = x.unsqueeze(1) @ normalize_rows(patches.descriptors.to(x)).transpose(-1, -2)  # (b, h, P, Q)
-        # No patch is worse than the opposite at the far end of the crop.
-        lowest = -2.0 - 2.0 * self.position_weight * index.info.grid
-        cosine = cosine.masked_fill(~patches.valid.unsqueeze(2), lowest)
-        best = cosine
+        x = normalize_rows(x).unsqueeze(1)
+        cosine = x @ normalize_rows(patches.descriptors.to(x)).transpose(-1, -2)  # (b, h, P, Q)
         if self.position_weight > 0:
             stride = index.info.stride
             at_crop = (query.pixels[rows] / stride).unsqueeze(1).expand(-1, cosine.shape[1], -1, -1)
-            at_template = patches.pixels.to(at_crop) / stride
-            placed = self._align(cosine.detach(), at_crop, at_template, valid)
-            best = cosine - self.position_weight * _distances(at_crop, placed)
-        matched = best.amax(dim=3).masked_fill(~valid.unsqueeze(1), 0.0)
+            at_template = (patches.pixels.to(at_crop) / stride).masked_fill(
+                ~patches.valid.unsqueeze(-1), _FAR_AWAY
+            )
+            with torch.no_grad():
+                A = self._align(cosine.detach(), at_crop, at_template, valid)
+                left, right = _squared_distances(A, at_crop, at_template)
+                distance = (left @ right).clamp_(min=0.0).sqrt_()
+            best = -distance.mul_(self.position_weight).sub_(cosine).amin(dim=3)
+        else:
+            best = cosine.masked_fill(~patches.valid.unsqueeze(2), -_FAR_AWAY).amax(dim=3)
+        matched = best.masked_fill(~valid.unsqueeze(1), 0.0)
         score = matched.sum(dim=2) / valid.sum(dim=1, keepdim=True).clamp(min=1)
         usable = candidates.valid[rows] & patches.valid.any(dim=2)
         return score.masked_fill(~usable, -torch.inf)
 
     def _align(self, cosine: Tensor, at_crop: Tensor, at_template: Tensor, valid: Tensor) -> Tensor:
-        """Places (b, h, Q, 2) of the templates' patches once they are aligned with the crop, in cells."""
-        if self.alignment == "none":
-            return at_template
+        """Transforms (b, h, 2, 3) that bring the templates' patches to the crop's, in cells."""
         A = identity_similarity(at_template)
-        for early in (*_EARLY_WEIGHTS, 1.0):
-            placed = apply_similarity(A, at_template)
-            nearest = (cosine - early * self.position_weight * _distances(at_crop, placed)).max(dim=3)
-            source = at_template.gather(2, nearest.indices.unsqueeze(-1).expand_as(at_crop))
-            alike = cosine.gather(3, nearest.indices.unsqueeze(-1)).squeeze(-1).clamp(min=0.0)
-            weight = alike.square() * valid.unsqueeze(1)
-            A = fit_similarity_robustly(source, at_crop, weight, _FIT_SCALES, self.alignment, A)
-        return apply_similarity(A, at_template)
+        if self.alignment == "none":
+            return A
+        few = slice(_ALIGNMENT_PATCHES)
+        cosine, at_crop = cosine[:, :, few].contiguous(), at_crop[:, :, few]
+        for weight in _ALIGNMENT_WEIGHTS:
+            left, right = _squared_distances(A, at_crop, at_template)
+            cost = weight * self.position_weight / _ALIGNMENT_CELLS
+            score = torch.baddbmm(*(x.flatten(0, 1) for x in (cosine, left, right)), alpha=-cost)
+            nearest = score.argmax(dim=2).view(at_crop.shape[:-1]).unsqueeze(-1)
+            source = at_template.gather(2, nearest.expand_as(at_crop))
+            alike = cosine.gather(3, nearest).squeeze(-1).clamp(min=0.0)
+            trust = alike.square() * valid[:, few].unsqueeze(1)
+            A = fit_similarity_robustly(source, at_crop, trust, _FIT_SCALES, self.alignment, A)
+        return A
 
     def onboarding_settings(self) -> dict[str, str]:
         """Those of the retriever."""
@@ -163,13 +170,15 @@ class SpatialReranker(Retriever):
 
 
 def _spread(query: QueryPatches, most: int | None) -> QueryPatches:
-    """At most so many of each crop's valid patches, which come first, evenly spread over them."""
-    if most is None or query.valid.shape[1] <= most:
-        return query
+    """At most so many of each crop's valid patches, in an order whose every beginning is evenly spread."""
+    available = query.valid.shape[1]
+    most = available if most is None else min(most, available)
     place = torch.arange(most, device=query.valid.device)
+    # Multiples of the golden ratio's inverse leave no gaps, however many are taken.
+    place = (place * 0.6180339887498949).remainder(1.0).argsort()
     count = query.valid.sum(dim=1, keepdim=True)
     number = count.clamp(max=most)
-    chosen = ((place * count) // number.clamp(min=1)).clamp(max=query.valid.shape[1] - 1)
+    chosen = ((place * count) // number.clamp(min=1)).clamp(max=available - 1)
     return query._replace(
         descriptors=torch.take_along_dim(query.descriptors, chosen.unsqueeze(-1), dim=1),
         pixels=torch.take_along_dim(query.pixels, chosen.unsqueeze(-1), dim=1),
@@ -177,8 +186,15 @@ def _spread(query: QueryPatches, most: int | None) -> QueryPatches:
     )
 
 
-def _distances(x: Tensor, y: Tensor) -> Tensor:
-    """Distances (..., P, Q) of points (..., P, 2) and (..., Q, 2)."""
-    squared = (x[..., 0].unsqueeze(-1) - y[..., 0].unsqueeze(-2)).square_()
-    squared += (x[..., 1].unsqueeze(-1) - y[..., 1].unsqueeze(-2)).square_()
-    return squared.sqrt_()
+def _squared_distances(A: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+    """Factors (..., P, 4) and (..., 4, Q) of the squared distances between points x (..., P, 2) and points
+    y (..., Q, 2) moved by similarity transforms A (..., 2, 3).
+
+    ``|x − sRy − t|² = |x − t|² − 2 (sR)ᵀ(x − t) · y + s² |y|²``.
+    """
+    linear, moved = A[..., :2], x - A[..., None, :, 2]
+    squared_scale = 0.5 * linear.square().sum(dim=(-2, -1))
+    left = [-2.0 * (moved @ linear), squared_scale[..., None, None].expand_as(x[..., :1])]
+    left.append(moved.square().sum(dim=-1, keepdim=True))
+    right = [y, y.square().sum(dim=-1, keepdim=True), torch.ones_like(y[..., :1])]
+    return torch.cat(left, dim=-1), torch.cat(right, dim=-1).transpose(-1, -2)
