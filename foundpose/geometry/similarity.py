@@ -44,7 +44,7 @@ def fit_similarity(source: Tensor, target: Tensor, weight: Tensor, motion: InPla
     Differentiable w.r.t. all tensors.
     Source: Umeyama, "Least-squares estimation of transformation parameters", 1991, in the plane.
     """
-    return _fit(*(points.transpose(-1, -2).contiguous() for points in (source, target)), weight, motion)
+    return _fit(_rows(source), _rows(target), weight, motion)
 
 
 def fit_similarity_robustly(
@@ -69,11 +69,16 @@ def fit_similarity_robustly(
     Differentiable w.r.t. all tensors.
     """
     A = identity_similarity(source) if start is None else start
-    source, target = (points.transpose(-1, -2).contiguous() for points in (source, target))
+    source, target = _rows(source), _rows(target)
     for scale in scales:
         squared = (A[..., :2] @ source + A[..., 2:] - target).square().sum(dim=-2)
         A = _fit(source, target, weight / (1.0 + squared / scale**2), motion)
     return A
+
+
+def _rows(points: Tensor) -> Tensor:
+    """Points (..., N, 2) as (..., 2, N)."""
+    return points.transpose(-1, -2).contiguous()
 
 
 def _fit(source: Tensor, target: Tensor, weight: Tensor, motion: InPlane) -> Tensor:
