@@ -9,7 +9,7 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from foundpose.ablation import run_once
+from ablation import run_once
 from foundpose.config import clear_errors
 
 

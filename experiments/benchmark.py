@@ -11,10 +11,10 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from foundpose.benchmark.report import write_report
-from foundpose.benchmark.run import run_benchmark
+from benchmarking.report import write_report
+from benchmarking.run import run_benchmark
 from foundpose.config import clear_errors
-from foundpose.progress import ProgressBars
+from foundpose.utils.progress import ProgressBars
 
 
 @hydra.main(version_base="1.3", config_path="../conf", config_name="benchmark")

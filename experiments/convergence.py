@@ -20,8 +20,6 @@ from tqdm import tqdm
 from foundpose.bop import BopDataset, Instance, ground_truth_instances
 from foundpose.config import build_method, clear_errors, wanted_objects
 from foundpose.geometry import make_transform, project_to_rotation
-from foundpose.io import write_atomically
-from foundpose.progress import ProgressBars
 from foundpose.refinement import PoseProposals, RefinedPoses
 from foundpose.refinement.convergence import (
     PoseDeviation,
@@ -30,6 +28,8 @@ from foundpose.refinement.convergence import (
     pose_deviation,
 )
 from foundpose.rendering import load_mesh
+from foundpose.utils.files import write_atomically
+from foundpose.utils.progress import ProgressBars
 
 
 @hydra.main(version_base="1.3", config_path="../conf", config_name="convergence")

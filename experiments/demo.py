@@ -15,12 +15,12 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from foundpose.config import Method, build_method, clear_errors
-from foundpose.estimates import PoseEstimates
 from foundpose.geometry import rotation_angle
-from foundpose.onboarding import ObjectRepresentation
-from foundpose.progress import ProgressBars
-from foundpose.scenes import KnownScene
+from foundpose.pipeline.results import PoseEstimates
+from foundpose.representation import ObjectRepresentation
+from foundpose.utils.progress import ProgressBars
 from foundpose.visualization import save_estimate_figure
+from scenes import KnownScene
 
 
 @hydra.main(version_base="1.3", config_path="../conf", config_name="demo")

@@ -28,15 +28,21 @@ from foundpose.bop import (
     write_results,
 )
 from foundpose.config import Method, build_method, claim_run_folder, clear_errors, wanted_objects
-from foundpose.estimates import PoseEstimates
+from foundpose.evaluation.objects import DatasetObjects
+from foundpose.evaluation.records import (
+    add_image_times,
+    best_results,
+    instance_record,
+    pose_records,
+    to_results,
+)
 from foundpose.geometry import boxes_from_xywh, intrinsics_matrix, masks_from_boxes
-from foundpose.io import write_json
-from foundpose.objects import DatasetObjects
-from foundpose.onboarding import ObjectRepresentation
-from foundpose.progress import ProgressBars
-from foundpose.records import add_image_times, best_results, instance_record, pose_records, to_results
+from foundpose.pipeline.results import PoseEstimates
 from foundpose.rendering import Mesh, Renderer, load_mesh
-from foundpose.timing import StageTimer
+from foundpose.representation import ObjectRepresentation
+from foundpose.utils.files import write_json
+from foundpose.utils.progress import ProgressBars
+from foundpose.utils.timing import StageTimer
 from foundpose.visualization import save_estimate_figure
 
 # Settings that may change when a run is resumed.

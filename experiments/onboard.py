@@ -13,9 +13,9 @@ from omegaconf import DictConfig
 
 from foundpose.bop import BopDataset
 from foundpose.config import Method, build_method, clear_errors, wanted_objects
-from foundpose.progress import ProgressBars
 from foundpose.rendering import load_mesh
-from foundpose.timing import StageTimer
+from foundpose.utils.progress import ProgressBars
+from foundpose.utils.timing import StageTimer
 
 
 def meshes_to_onboard(cfg: DictConfig) -> dict[str, Path]:

@@ -29,13 +29,13 @@ from matplotlib.ticker import FuncFormatter, NullFormatter, NullLocator
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
+from benchmarking import ScriptedExtractor, Workload, WorkloadSizes, make_workload
+from benchmarking.hardware import describe_hardware, describe_versions
 from foundpose import FoundPose
-from foundpose.benchmark import ScriptedExtractor, Workload, WorkloadSizes, make_workload
-from foundpose.benchmark.hardware import describe_hardware, describe_versions
 from foundpose.config import clear_errors
-from foundpose.io import write_atomically, write_json
-from foundpose.onboarding import ObjectRepresentation
-from foundpose.onboarding.quantization import Storage
+from foundpose.representation import ObjectRepresentation
+from foundpose.representation.quantization import Storage
+from foundpose.utils.files import write_atomically, write_json
 
 _MIB = 2**20
 _GIB = 2**30

@@ -25,8 +25,6 @@ from safetensors.torch import load_file, save_file
 from foundpose.config import build_method, claim_run_folder, clear_errors
 from foundpose.features import ResidualAdapter
 from foundpose.geometry import Symmetries, stack_symmetries, symmetries_from_models_info
-from foundpose.io import write_atomically
-from foundpose.progress import ProgressBars
 from foundpose.rendering import Mesh, load_mesh
 from foundpose.training import (
     AdapterTraining,
@@ -37,6 +35,8 @@ from foundpose.training import (
     summarize,
 )
 from foundpose.training.meshes import meshes_to_train_on, small_mesh
+from foundpose.utils.files import write_atomically
+from foundpose.utils.progress import ProgressBars
 
 # Settings that may change when a run is resumed; with more epochs in trainer it trains on.
 MAY_CHANGE = ("device", "representations", "trainer")

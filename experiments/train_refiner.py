@@ -21,8 +21,6 @@ from safetensors.torch import save_file
 from torch import nn
 
 from foundpose.config import claim_run_folder, clear_errors
-from foundpose.io import write_atomically
-from foundpose.progress import ProgressBars
 from foundpose.refinement import RenderAndCompareRefiner, UpdateNetwork
 from foundpose.rendering import Mesh, load_mesh
 from foundpose.training import (
@@ -35,6 +33,8 @@ from foundpose.training import (
     summarize_refinement,
 )
 from foundpose.training.meshes import meshes_to_train_on, small_mesh
+from foundpose.utils.files import write_atomically
+from foundpose.utils.progress import ProgressBars
 
 # Settings that may change when a run is resumed; with more epochs in trainer it trains on.
 MAY_CHANGE = ("device", "representations", "trainer")

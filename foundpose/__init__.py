@@ -1,14 +1,16 @@
 """6D pose of unseen objects from one RGB image: FoundPose (ECCV 2024) as differentiable, batched modules."""
 
-from foundpose.estimates import PoseEstimates, PoseStatus
 from foundpose.features import DenseSift, DinoV2, FeatureHook, PatchExtractor, PcaProjection
 from foundpose.geometry import PerspectiveCrop, SphereInplane, SuperFibonacci
 from foundpose.matching import PatchMatcher, SoftPatchMatcher
-from foundpose.onboarding import ObjectRepresentation, Onboarder, RepresentationStore
+from foundpose.onboarding import Onboarder, RepresentationStore
 from foundpose.pipeline import FoundPose
+from foundpose.pipeline.results import PoseEstimates, PoseStatus
+from foundpose.pipeline.verification import InlierScore, PatchVerification
 from foundpose.pnp import GaussNewtonPnp, RansacPnp, SoftInlierSelection, TemplateStart, TopTemplatePose
 from foundpose.refinement import FeaturemetricRefiner, PoseRefiner, RefinerChain, RenderAndCompareRefiner
 from foundpose.rendering import Mesh, PyrenderRenderer, RaycastRenderer, load_mesh
+from foundpose.representation import ObjectRepresentation
 from foundpose.retrieval import (
     ClsRetriever,
     PatchVoteRetriever,
@@ -17,7 +19,6 @@ from foundpose.retrieval import (
     TemplateRetriever,
     VisualWords,
 )
-from foundpose.verification import InlierScore, PatchVerification
 
 __version__ = "0.1.0"
 

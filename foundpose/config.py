@@ -16,10 +16,10 @@ from omegaconf import DictConfig, OmegaConf
 
 from foundpose.bop import BopDataset
 from foundpose.features import PatchExtractor
-from foundpose.io import write_atomically
 from foundpose.onboarding import ArtefactStore, Onboarder, RepresentationStore
 from foundpose.pipeline import FoundPose
 from foundpose.rendering import RendererNotAvailableError
+from foundpose.utils.files import write_atomically
 
 # Settings that may change when an evaluation is resumed: they change no pose, or say where things lie and what they
 # are called.

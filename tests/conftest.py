@@ -7,8 +7,9 @@ import torch
 
 from foundpose.features import CoordinateCode, PcaProjection
 from foundpose.geometry import SuperFibonacci
-from foundpose.onboarding import ObjectRepresentation, Onboarder
+from foundpose.onboarding import Onboarder
 from foundpose.rendering import CoordinateRenderer, Mesh
+from foundpose.representation import ObjectRepresentation
 from foundpose.retrieval import SoftAssignBow, VisualWords
 from foundpose.synthetic import procedural_mesh
 from tests.bop_dataset import make_bop_dataset

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from foundpose.bop.files import BopError, describe_folder
 from foundpose.bop.targets import Target, describe_target
-from foundpose.io import write_atomically
+from foundpose.utils.files import write_atomically
 
 HEADER = ["scene_id", "im_id", "obj_id", "score", "R", "t", "time"]
 # Seconds by which the times of an image's results may differ in the benchmark's own check.

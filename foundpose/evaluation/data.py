@@ -11,12 +11,12 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
-from foundpose.batch_size import BatchSize, check_batch_size, measure_batch_size
 from foundpose.bop import BopDataset, Instance
+from foundpose.bop.pictures import Photographs
+from foundpose.evaluation.objects import DatasetObjects
 from foundpose.evaluation.shards import keep_batch_size, read_batch_size, read_shards
-from foundpose.objects import DatasetObjects
-from foundpose.pictures import Photographs
-from foundpose.progress import ProgressBars
+from foundpose.utils.batch_size import BatchSize, check_batch_size, measure_batch_size
+from foundpose.utils.progress import ProgressBars
 
 Order = Literal["image", "object"]
 
@@ -81,7 +81,7 @@ class InstanceBatches(Dataset[PoseBatch]):
 
     Args:
         dataset: where images, intrinsics and masks come from.
-        pictures: makes the picture of an image (:class:`foundpose.pictures.Photographs`, for one).
+        pictures: makes the picture of an image (:class:`foundpose.bop.pictures.Photographs`, for one).
         batches: the plan.
         images_kept: pictures kept for the next batch, which often begins with the image that the last ended with.
     """

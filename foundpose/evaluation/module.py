@@ -9,11 +9,11 @@ import torch
 from torch import nn
 
 from foundpose.evaluation.data import PoseBatch, PoseDataModule
+from foundpose.evaluation.objects import DatasetObjects
+from foundpose.evaluation.records import instance_record, pose_records
 from foundpose.evaluation.shards import BatchRecord, ShardWriter
-from foundpose.objects import DatasetObjects
 from foundpose.pipeline import FoundPose
-from foundpose.records import instance_record, pose_records
-from foundpose.timing import StageTimer
+from foundpose.utils.timing import StageTimer
 
 _STAGES = ("crop", "extractor", "retriever", "matcher", "pnp", "refiner")
 

@@ -9,8 +9,8 @@ from typing import Any
 import torch
 
 from foundpose.bop import Instance
+from foundpose.evaluation.records import add_image_times
 from foundpose.evaluation.shards import BatchRecord, read_shards
-from foundpose.records import add_image_times
 
 
 def merge_shards(folder: Path, batches: Sequence[Sequence[Instance]]) -> list[BatchRecord]:

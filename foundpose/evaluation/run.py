@@ -23,11 +23,11 @@ from foundpose.bop import (
 from foundpose.config import MAY_CHANGE, build_method, claim_run_folder, wanted_objects
 from foundpose.evaluation.data import PoseDataModule
 from foundpose.evaluation.module import PoseEvaluation, estimate_dataset
+from foundpose.evaluation.objects import DatasetObjects
+from foundpose.evaluation.records import best_results, to_results
 from foundpose.evaluation.report import all_records, merge_shards, timing
-from foundpose.io import write_json
-from foundpose.objects import DatasetObjects
-from foundpose.progress import ProgressBars
-from foundpose.records import best_results, to_results
+from foundpose.utils.files import write_json
+from foundpose.utils.progress import ProgressBars
 
 
 def run_evaluation(cfg: DictConfig, output: Path) -> Scores | None:

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 from filelock import FileLock
 
 from foundpose.bop import Instance
-from foundpose.io import write_json
-from foundpose.records import instance_record
+from foundpose.evaluation.records import instance_record
+from foundpose.utils.files import write_json
 
 
 class BatchRecord(NamedTuple):

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from foundpose.features.base import Fingerprint, PatchExtractor, PatchFeatures
-from foundpose.io import check_weights, read_weights, save_weights
+from foundpose.utils.files import check_weights, read_weights, save_weights
 
 SCHEMA_VERSION = 1
 _HEADER = "foundpose_adapter"

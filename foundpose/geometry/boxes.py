@@ -5,7 +5,7 @@
 import torch
 from torch import Tensor
 
-from foundpose.devices import constant
+from foundpose.utils.devices import constant
 
 
 def boxes_from_masks(masks: Tensor) -> tuple[Tensor, Tensor]:

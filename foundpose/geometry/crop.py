@@ -5,10 +5,10 @@ from typing import Literal, NamedTuple, get_args
 import torch
 from torch import Tensor, nn
 
-from foundpose.devices import constant, indices_on
 from foundpose.geometry.boxes import boxes_from_masks, masks_from_boxes
 from foundpose.geometry.cameras import camera_on_boxes
 from foundpose.geometry.warp import sample_pixels, sample_pyramids, warped_pixels
+from foundpose.utils.devices import constant, indices_on
 
 Background = Literal["keep", "black"]
 

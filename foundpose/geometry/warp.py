@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from foundpose.devices import indices_on
+from foundpose.utils.devices import indices_on
 
 
 def warped_pixels(homographies: Tensor, size: int) -> Tensor:

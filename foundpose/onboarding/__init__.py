@@ -3,12 +3,6 @@
 from foundpose.onboarding.artefacts import ArtefactEntry, ArtefactStore
 from foundpose.onboarding.cached import CachedOnboarding
 from foundpose.onboarding.onboarder import Onboarder
-from foundpose.onboarding.representation import (
-    ObjectRepresentation,
-    RepresentationInfo,
-    TemplatePatches,
-    read_info,
-)
 from foundpose.onboarding.stages import Progress
 from foundpose.onboarding.store import RepresentationStore
 from foundpose.onboarding.templates import TemplateCameras, register_patches, template_cameras
@@ -17,14 +11,10 @@ __all__ = [
     "ArtefactEntry",
     "ArtefactStore",
     "CachedOnboarding",
-    "ObjectRepresentation",
     "Onboarder",
     "Progress",
-    "RepresentationInfo",
     "RepresentationStore",
     "TemplateCameras",
-    "TemplatePatches",
-    "read_info",
     "register_patches",
     "template_cameras",
 ]

@@ -15,7 +15,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from foundpose.io import write_atomically
+from foundpose.utils.files import write_atomically
 
 ARTEFACT_VERSION = 1
 
@@ -48,7 +48,7 @@ def load_or_make(path: Path, load: Callable[[Path], _T | None], make: Callable[[
     Args:
         path: the file.
         load: reads it; returns None where it is missing or broken.
-        make: writes it by :func:`foundpose.io.write_atomically`.
+        make: writes it by :func:`foundpose.utils.files.write_atomically`.
 
     Raises:
         OSError: what ``make`` wrote cannot be read.

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from foundpose.onboarding.representation import ObjectRepresentation
+from foundpose.representation.object_representation import ObjectRepresentation
 from foundpose.retrieval import IdfMode, SoftAssignBow, WordAssignment
 from foundpose.retrieval.bow import inverse_document_frequency, word_counts
 from foundpose.retrieval.retriever import normalize_rows

@@ -12,10 +12,10 @@ from foundpose.onboarding.artefacts import ArtefactStore
 from foundpose.onboarding.compression import PackedPictures, join_pictures, pack_pictures, unpack_pictures
 from foundpose.onboarding.onboarder import Onboarder
 from foundpose.onboarding.prefetch import pin
-from foundpose.onboarding.representation import ObjectRepresentation
 from foundpose.onboarding.stages import FittedWords, PatchTable, Progress, TemplatePictures, ignore_progress
 from foundpose.onboarding.templates import TemplateCameras
 from foundpose.rendering import Mesh
+from foundpose.representation.object_representation import ObjectRepresentation
 
 Facts = dict[str, Any]
 _PROJECTION = "projection."

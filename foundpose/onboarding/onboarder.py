@@ -10,14 +10,11 @@ from typing import TypeVar, get_args
 import torch
 from torch import Tensor, nn
 
-from foundpose.batch_size import BatchSize, check_batch_size, measure_batch_size
 from foundpose.features.base import PatchExtractor
 from foundpose.features.pca import CovarianceAccumulator, PcaProjection
 from foundpose.onboarding.bags import describe_by_words
 from foundpose.onboarding.compression import dequantize, quantize
 from foundpose.onboarding.prefetch import pin, prefetch, upload
-from foundpose.onboarding.quantization import Storage, check_storage
-from foundpose.onboarding.representation import ObjectRepresentation, RepresentationInfo
 from foundpose.onboarding.scales import measure_scales
 from foundpose.onboarding.stages import (
     FittedWords,
@@ -29,7 +26,10 @@ from foundpose.onboarding.stages import (
 )
 from foundpose.onboarding.templates import TemplateCameras, register_patches, template_cameras
 from foundpose.rendering import Mesh, Renderer
+from foundpose.representation.object_representation import ObjectRepresentation, RepresentationInfo
+from foundpose.representation.quantization import Storage, check_storage
 from foundpose.retrieval import IdfMode, SoftAssignBow, VisualWords
+from foundpose.utils.batch_size import BatchSize, check_batch_size, measure_batch_size
 
 _T = TypeVar("_T")
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from foundpose.onboarding.representation import ObjectRepresentation
+from foundpose.representation.object_representation import ObjectRepresentation
 from foundpose.retrieval.base import normalize_rows
 from foundpose.retrieval.bow import nearest_words
 

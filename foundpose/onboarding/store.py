@@ -7,9 +7,9 @@ from pathlib import Path
 from foundpose.onboarding.artefacts import ArtefactStore, load_or_make
 from foundpose.onboarding.cached import CachedOnboarding
 from foundpose.onboarding.onboarder import Onboarder
-from foundpose.onboarding.representation import SCHEMA_VERSION, ObjectRepresentation
 from foundpose.onboarding.stages import Progress
 from foundpose.rendering import Mesh
+from foundpose.representation.object_representation import SCHEMA_VERSION, ObjectRepresentation
 
 
 class RepresentationStore:

@@ -16,11 +16,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from foundpose.devices import constant
 from foundpose.geometry.transforms import make_transform, transform_points
 from foundpose.optimization.derivatives import attach_optimum, eigenbasis, safe_sqrt
 from foundpose.pnp.polish import check_correspondences, rays_of_usable_pixels, usable_coordinates
 from foundpose.pnp.weak_perspective import align_points, weak_perspective_depths
+from foundpose.utils.devices import constant
 
 # Relative squared area below which points count as collinear; far above float32's rounding.
 _COLLINEAR = 1e-5

@@ -8,8 +8,8 @@ from torch import Tensor, nn
 
 from foundpose.features import PatchFeatures
 from foundpose.geometry import Crops
-from foundpose.onboarding import ObjectRepresentation
 from foundpose.rendering import Mesh
+from foundpose.representation import ObjectRepresentation
 
 
 class PoseProposals(NamedTuple):

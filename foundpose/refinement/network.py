@@ -6,8 +6,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from foundpose.io import check_weights, read_weights, save_weights
 from foundpose.refinement.pose_update import IDENTITY_UPDATE, UPDATE_SIZE
+from foundpose.utils.files import check_weights, read_weights, save_weights
 
 SCHEMA_VERSION = 1
 _HEADER = "foundpose_update_network"

@@ -6,10 +6,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from foundpose.devices import indices_on
 from foundpose.geometry import project_points, transform_points
 from foundpose.refinement.base import PoseProposals, PoseRefiner, RefinedPoses
 from foundpose.refinement.featuremetric import AlignmentProblem, FeaturemetricAlignment
+from foundpose.utils.devices import indices_on
 
 
 class FeaturemetricRefiner(PoseRefiner):

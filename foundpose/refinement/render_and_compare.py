@@ -6,12 +6,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from foundpose.devices import constant
 from foundpose.geometry import camera_on_boxes, invert_transform, project_points, transform_points
 from foundpose.geometry.warp import warp_images
 from foundpose.refinement.base import PoseProposals, PoseRefiner, RefinedPoses
 from foundpose.refinement.pose_update import UPDATE_SIZE, apply_update
 from foundpose.rendering import Mesh, Renderer
+from foundpose.utils.devices import constant
 
 # Objects that come nearer than this share of their own depth are not rendered: they surround the camera.
 _NEAR = 0.01

@@ -8,7 +8,6 @@ from foundpose.retrieval.bow import (
     WordAssignment,
     inverse_document_frequency,
 )
-from foundpose.retrieval.kmeans import KMeansResult, kmeans
 from foundpose.retrieval.retriever import ClsRetriever, TemplateRetriever
 from foundpose.retrieval.spatial import SpatialReranker
 from foundpose.retrieval.votes import PatchVoteRetriever
@@ -18,7 +17,6 @@ __all__ = [
     "BowNormalization",
     "ClsRetriever",
     "IdfMode",
-    "KMeansResult",
     "PatchVoteRetriever",
     "QueryPatches",
     "RetrievedTemplates",
@@ -30,5 +28,4 @@ __all__ = [
     "VisualWords",
     "WordAssignment",
     "inverse_document_frequency",
-    "kmeans",
 ]

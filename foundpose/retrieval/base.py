@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 if TYPE_CHECKING:  # the representation's own module imports this package
-    from foundpose.onboarding.representation import RepresentationInfo, TemplatePatches
+    from foundpose.representation.object_representation import RepresentationInfo, TemplatePatches
 
 
 class QueryPatches(NamedTuple):

@@ -2,11 +2,11 @@
 
 from torch import Tensor, nn
 
-from foundpose.retrieval.kmeans import Progress, kmeans
+from foundpose.clustering.kmeans import Progress, kmeans
 
 
 class VisualWords(nn.Module):
-    """Clusters descriptors to visual words; see :func:`foundpose.retrieval.kmeans.kmeans`.
+    """Clusters descriptors to visual words; see :func:`foundpose.clustering.kmeans.kmeans`.
 
     Args:
         num_words: number k of words.

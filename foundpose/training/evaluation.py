@@ -12,9 +12,10 @@ from foundpose.losses import geodesic_rotation_error, point_matching_error
 from foundpose.losses.alignment import best_symmetry
 from foundpose.losses.points import nearest_angles_of_points
 from foundpose.losses.reduction import mean_norm, place_points
-from foundpose.onboarding import ObjectRepresentation, Progress
+from foundpose.onboarding import Progress
 from foundpose.pipeline import FoundPose
 from foundpose.rendering import Mesh, Renderer
+from foundpose.representation import ObjectRepresentation
 from foundpose.retrieval import QueryPatches, RetrievedTemplates
 from foundpose.retrieval.base import TemplateIndex
 from foundpose.synthetic import LightVariation, cluttered_scene

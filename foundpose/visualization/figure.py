@@ -9,11 +9,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from torch import Tensor
 
-from foundpose.estimates import PoseEstimates, PoseStatus
 from foundpose.geometry import project_points, transform_points
-from foundpose.io import write_atomically
-from foundpose.onboarding import ObjectRepresentation
+from foundpose.pipeline.results import PoseEstimates, PoseStatus
 from foundpose.rendering import Mesh, Renderer
+from foundpose.representation import ObjectRepresentation
+from foundpose.utils.files import write_atomically
 from foundpose.visualization.overlay import COARSE, REFINED, TRUTH, Color, draw_axes, draw_contour
 
 _MOST_LINES = 60

@@ -13,7 +13,7 @@ import pytest
 from foundpose.bop import check_times, read_results
 from foundpose.evaluation.shards import shard_path
 from tests.bop_dataset import make_bop_dataset
-from tests.test_experiments import SMALL, run_app
+from tests.experiments.test_apps import SMALL, run_app
 
 ROOT = Path(__file__).resolve().parents[2]
 NUM_IMAGES = 6

@@ -8,11 +8,11 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from foundpose.bop import BopDataset, Instance, detected_instances, ground_truth_instances
+from foundpose.bop.pictures import Photographs
 from foundpose.evaluation import BatchRecord, InstanceBatches, ShardWriter, plan_batches, read_shards
 from foundpose.evaluation.data import BatchesOfRank
+from foundpose.evaluation.records import instance_record
 from foundpose.evaluation.shards import shard_path
-from foundpose.pictures import Photographs
-from foundpose.records import instance_record
 
 
 def instances(count, seed=0):

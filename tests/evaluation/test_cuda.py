@@ -5,16 +5,16 @@ import pytorch_lightning as pl
 import torch
 
 from foundpose.bop import BopDataset, ground_truth_instances, score_results
+from foundpose.bop.pictures import TrueCoordinates
 from foundpose.evaluation import PoseDataModule, PoseEvaluation, all_records, estimate_dataset, merge_shards
+from foundpose.evaluation.objects import DatasetObjects
+from foundpose.evaluation.records import to_results
 from foundpose.features import CoordinateCode
 from foundpose.geometry import SuperFibonacci, rotation_angle
-from foundpose.objects import DatasetObjects
 from foundpose.onboarding import Onboarder, RepresentationStore
-from foundpose.pictures import TrueCoordinates
-from foundpose.records import to_results
 from foundpose.rendering import CoordinateRenderer
 from foundpose.retrieval import SoftAssignBow, VisualWords
-from tests.test_pipeline import make_pipeline
+from tests.pipeline.test_foundpose import make_pipeline
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")

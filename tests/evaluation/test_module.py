@@ -6,9 +6,10 @@ import pytorch_lightning as pl
 import torch
 from PIL import Image
 
-import foundpose.batch_size
-import foundpose.timing
+import foundpose.utils.batch_size
+import foundpose.utils.timing
 from foundpose.bop import BopDataset, detected_instances, ground_truth_instances
+from foundpose.bop.pictures import TrueCoordinates
 from foundpose.evaluation import (
     PoseDataModule,
     PoseEvaluation,
@@ -17,14 +18,13 @@ from foundpose.evaluation import (
     merge_shards,
     timing,
 )
+from foundpose.evaluation.objects import DatasetObjects
+from foundpose.evaluation.records import to_results
 from foundpose.evaluation.shards import shard_path
 from foundpose.geometry import rotation_angle
-from foundpose.objects import DatasetObjects
 from foundpose.onboarding import RepresentationStore
-from foundpose.pictures import TrueCoordinates
-from foundpose.records import to_results
 from tests.bop_dataset import make_bop_dataset
-from tests.test_pipeline import make_pipeline
+from tests.pipeline.test_foundpose import make_pipeline
 
 NUM_IMAGES = 5
 
@@ -227,7 +227,7 @@ def test_workers_read_the_same_batches(root, store, tmp_path):
 
 def test_the_size_is_kept_in_the_folder_and_taken_from_there(root, store, tmp_path, monkeypatch):
     tried = []
-    monkeypatch.setattr(foundpose.batch_size, "free_memory", lambda device: 10**12)
+    monkeypatch.setattr(foundpose.utils.batch_size, "free_memory", lambda device: 10**12)
     estimate = PoseEvaluation.estimate
 
     def counted(self, batch, waiting=0.0):
@@ -246,7 +246,7 @@ def test_the_size_is_kept_in_the_folder_and_taken_from_there(root, store, tmp_pa
     (tmp_path / "batch_size.json").write_text('{"batch_size": 2}')
     (tmp_path / "shards" / "rank-00000.jsonl").unlink()
     tried.clear()
-    monkeypatch.setattr(foundpose.batch_size, "free_memory", lambda device: 0)
+    monkeypatch.setattr(foundpose.utils.batch_size, "free_memory", lambda device: 0)
     data, _, _ = run(root, store, tmp_path, masks=ground_truth_instances, batch_size="auto")
     assert tried == [2, 2, 1]
     assert [len(batch) for batch in data.batches] == [2, 2, 1]
@@ -273,8 +273,8 @@ def test_a_size_that_is_not_known_yet(root, store, tmp_path):
 def test_no_clock_waits_unless_stages_are_timed(root, store, tmp_path, monkeypatch):
     """On a machine with a GPU the only waits are those for results."""
     waits = []
-    monkeypatch.setattr(foundpose.timing.torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(foundpose.timing.torch.cuda, "synchronize", lambda *_: waits.append(1))
+    monkeypatch.setattr(foundpose.utils.timing.torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(foundpose.utils.timing.torch.cuda, "synchronize", lambda *_: waits.append(1))
     dataset = BopDataset(root)
     objects = DatasetObjects(dataset, store)
     for time_stages in (True, False):

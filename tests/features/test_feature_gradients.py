@@ -11,7 +11,7 @@ from torch.autograd import gradcheck
 from foundpose.features import CoordinateCode, DenseSift, DinoV2, FeatureHook, PatchExtractor, PcaProjection
 from foundpose.features.oracle import PatchNoise
 from foundpose.features.pca import CovarianceAccumulator, principal_components
-from foundpose.onboarding import ObjectRepresentation
+from foundpose.representation import ObjectRepresentation
 
 TINY = {"hidden_size": 32, "num_hidden_layers": 6, "num_attention_heads": 4, "image_size": 70}
 

@@ -10,8 +10,9 @@ from hydra import compose, initialize_config_dir
 from foundpose.config import build_method
 from foundpose.features import CoordinateCode, DenseSift, DinoV2, PcaProjection
 from foundpose.geometry import SphereInplane, SuperFibonacci
-from foundpose.onboarding import ArtefactStore, CachedOnboarding, ObjectRepresentation, RepresentationStore
+from foundpose.onboarding import ArtefactStore, CachedOnboarding, RepresentationStore
 from foundpose.rendering import CoordinateRenderer, RaycastRenderer
+from foundpose.representation import ObjectRepresentation
 from foundpose.retrieval import SoftAssignBow, VisualWords
 from foundpose.synthetic import procedural_mesh
 from tests.onboarding.jobs import SIZE, die_while_writing_descriptors, onboard, small_onboarder

@@ -5,8 +5,9 @@ from sklearn.decomposition import PCA
 
 from foundpose.features import CoordinateCode, DenseSift, PcaProjection
 from foundpose.geometry import SphereInplane, SuperFibonacci, project_points, transform_points
-from foundpose.onboarding import ObjectRepresentation, Onboarder, RepresentationStore
+from foundpose.onboarding import Onboarder, RepresentationStore
 from foundpose.rendering import CoordinateRenderer, RaycastRenderer
+from foundpose.representation import ObjectRepresentation
 from foundpose.retrieval import SoftAssignBow, VisualWords
 
 

@@ -7,8 +7,9 @@ import torch
 from foundpose import RaycastRenderer, SoftAssignBow
 from foundpose.features import DenseSift, PcaProjection
 from foundpose.geometry import SuperFibonacci
-from foundpose.onboarding import ObjectRepresentation, Onboarder
+from foundpose.onboarding import Onboarder
 from foundpose.onboarding.scales import measure_scales, true_matches
+from foundpose.representation import ObjectRepresentation
 from foundpose.retrieval import VisualWords
 from foundpose.synthetic import procedural_mesh
 

@@ -3,7 +3,7 @@ import json
 import pytest
 from PIL import Image
 
-from tests.test_experiments import SMALL, run_app
+from tests.experiments.test_apps import SMALL, run_app
 
 
 def test_convergence_app(tiny_bop, monkeypatch, tmp_path, capsys):

@@ -20,7 +20,7 @@ from foundpose.rendering import CoordinateRenderer
 from foundpose.rendering.coordinates import render_coordinate_image
 from foundpose.retrieval import SoftAssignBow, TemplateRetriever
 from foundpose.synthetic import procedural_mesh
-from tests.test_pipeline import SIZE, K, pose_at
+from tests.pipeline.test_foundpose import SIZE, K, pose_at
 
 
 def make_pipeline(**changes) -> FoundPose:

@@ -2,8 +2,8 @@ import pytest
 import torch
 
 from foundpose.features.pca import CovarianceAccumulator, PcaProjection
-from foundpose.onboarding import ObjectRepresentation
-from foundpose.onboarding.representation import RepresentationInfo
+from foundpose.representation import ObjectRepresentation
+from foundpose.representation.object_representation import RepresentationInfo
 from foundpose.retrieval import QueryPatches, SoftAssignBow, SpatialReranker, TemplateRetriever
 from foundpose.retrieval.base import RetrievedTemplates, Retriever
 

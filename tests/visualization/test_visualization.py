@@ -7,7 +7,7 @@ from foundpose import PoseStatus
 from foundpose.geometry import intrinsics_matrix
 from foundpose.rendering import CoordinateRenderer, RaycastRenderer
 from foundpose.visualization import TRUTH, draw_axes, draw_contour, save_estimate_figure
-from tests.test_pipeline import SIZE, K, make_pipeline, pose_at
+from tests.pipeline.test_foundpose import SIZE, K, make_pipeline, pose_at
 
 
 def test_contour_lies_around_the_mask(rng):

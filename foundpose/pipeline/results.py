@@ -1,0 +1,136 @@
+"""What the pipeline returns."""
+
+from enum import IntEnum
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from foundpose.geometry import Crops
+from foundpose.pnp import PnpStatus, PoseCandidates, TemplatePoses
+from foundpose.refinement.base import RefinedPoses
+from foundpose.retrieval import QueryPatches, RetrievedTemplates
+
+
+class PoseStatus(IntEnum):
+    """Why a crop has no pose. The codes of :class:`PnpStatus` keep their values."""
+
+    OK = PnpStatus.OK
+    TOO_FEW_CORRESPONDENCES = PnpStatus.TOO_FEW_CORRESPONDENCES
+    DEGENERATE = PnpStatus.DEGENERATE
+    BEHIND_CAMERA = PnpStatus.BEHIND_CAMERA
+    TOO_FEW_INLIERS = PnpStatus.TOO_FEW_INLIERS
+    UNUSABLE_MASK = 100
+    NO_PATCHES = 101
+    NO_TEMPLATE = 102
+
+
+class Correspondences(NamedTuple):
+    """2D-3D correspondences of B crops with h retrieved templates each.
+
+    Where poses are those of templates (:class:`foundpose.pnp.TopTemplatePose`) nothing is matched, and P is 0.
+
+    Attributes:
+        points_image: (B, P, 2) patch centres in the crop, pixels.
+        points_model: (B, h, P, 3) matched points, mesh units.
+        pixels_template: (B, h, P, 2) centres of the matched template patches, pixels of the template.
+        distance: (B, h, P) descriptor distances, +inf where not valid.
+        weight: (B, h, P) confidences in (0, 1], 0 where not valid.
+        valid: (B, h, P) bool.
+        priority: (B, h, P) order in which matches are trusted, −inf where not valid.
+    """
+
+    points_image: Tensor
+    points_model: Tensor
+    pixels_template: Tensor
+    distance: Tensor
+    weight: Tensor
+    valid: Tensor
+    priority: Tensor
+
+
+class PoseHypotheses(NamedTuple):
+    """One pose for each crop and retrieved template.
+
+    Attributes:
+        T_crop_from_model: (B, h, 4, 4), mesh units.
+        inliers: (B, h, P) bool.
+        num_inliers: (B, h); 0 without correspondences.
+        status: (B, h) codes of :class:`PoseStatus`.
+        score: (B, h) by the pipeline's scorer (:class:`~foundpose.pipeline.verification.InlierScore`: the share of
+            the crop's patches that are inliers); for poses of templates the similarity of the template. The larger
+            the better; means nothing where the status is not OK.
+    """
+
+    T_crop_from_model: Tensor
+    inliers: Tensor
+    num_inliers: Tensor
+    status: Tensor
+    score: Tensor
+
+
+class PoseEstimates(NamedTuple):
+    """Poses of a batch of crops, and what they were made from.
+
+    Attributes:
+        T_camera_from_model: (B, 4, 4), mesh units; finite but meaningless where not valid.
+        score: (B,) confidence in [0, 1] by the pipeline's scorer, or for poses of templates the similarity of the
+            template, at most 1. With a refiner it is that of the refined pose, or the refiner's own score where the
+            scorer looks at inliers only (0 for a pose that could not be refined and is returned as it was).
+        num_inliers: (B,) inlier correspondences of the chosen hypothesis; 0 for poses of templates.
+        valid: (B,) bool, a pose with at least the fewest inliers that the PnP stage asks for. It is no confidence:
+            noise can reach that many by chance. Judge by ``score``.
+        status: (B,) codes of :class:`PoseStatus`.
+        best: (B,) which hypothesis was chosen.
+        T_coarse: (B, 4, 4) its pose in the camera's frame before refinement; without a refiner the final one.
+        crops: the perspective crops.
+        query: the crops' patches.
+        templates: the retrieved templates.
+        correspondences: the matches.
+        hypotheses: the poses of all retrieved templates.
+        candidates: with a soft selection in the PnP stage, the hypotheses of all templates and samples with the
+            probability of choosing each (``T_camera_from_model`` (B, h · J, 4, 4)); None without.
+        refined: what the refiner made of the hypotheses that it was given, in the crop's frame; None without.
+    """
+
+    T_camera_from_model: Tensor
+    score: Tensor
+    num_inliers: Tensor
+    valid: Tensor
+    status: Tensor
+    best: Tensor
+    T_coarse: Tensor
+    crops: Crops
+    query: QueryPatches
+    templates: RetrievedTemplates
+    correspondences: Correspondences
+    hypotheses: PoseHypotheses
+    candidates: PoseCandidates | None = None
+    refined: RefinedPoses | None = None
+
+
+def no_correspondences(query: QueryPatches, templates: RetrievedTemplates) -> Correspondences:
+    """What stands where nothing was matched: no point of any crop."""
+    B, h = templates.index.shape
+    pixels = query.pixels
+    nothing = pixels.new_zeros(B, h, 0)
+    return Correspondences(
+        points_image=pixels.new_zeros(B, 0, 2),
+        points_model=pixels.new_zeros(B, h, 0, 3),
+        pixels_template=pixels.new_zeros(B, h, 0, 2),
+        distance=nothing,
+        weight=nothing,
+        valid=nothing.bool(),
+        priority=nothing,
+    )
+
+
+def template_hypotheses(poses: TemplatePoses, templates: RetrievedTemplates) -> PoseHypotheses:
+    """Aligned templates as hypotheses, as good as the templates are similar."""
+    return PoseHypotheses(
+        T_crop_from_model=poses.T_crop_from_model,
+        inliers=torch.zeros_like(templates.valid).unsqueeze(-1)[..., :0],
+        num_inliers=torch.zeros_like(poses.status),
+        status=poses.status.masked_fill(~templates.valid, int(PoseStatus.NO_TEMPLATE)),
+        score=templates.similarity,
+    )

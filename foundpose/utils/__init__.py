@@ -1,0 +1,1 @@
+"""Files, devices, timing, progress, batch size."""

@@ -1,0 +1,51 @@
+"""Every experiment file runs from mesh to scores, with small random networks in place of those that need weights."""
+
+import json
+
+import pytest
+
+from ablation.runs import run_once
+from tests.test_config import CONF, SIZES, load
+from tests.test_config import SMALL as SMALL_NETWORKS
+
+EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
+
+
+def small_network(cfg):
+    """Overrides that make an experiment's extractor one that needs no weights, and quick."""
+    kind = cfg.extractor._target_.rpartition(".")[2].lower().removesuffix("backbone")
+    if kind in ("densesift", "coordinatecode"):
+        return []
+    common = ["extractor.weights=random", "extractor.seed=0"]
+    if kind == "dinov2":
+        return [*common, "extractor.layer=0", f"extractor.config={{{SIZES}}}"]
+    return common + SMALL_NETWORKS[kind]
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_experiment_runs(name, tiny_bop, tmp_path):
+    plain = load("ablate", f"experiment={name}")
+    count = ["num_views=2", "num_inplane=4"] if "num_views" in plain.viewpoints else ["count=8"]
+    overrides = [
+        f"experiment={name}",
+        f"data.root={tiny_bop}",
+        f"folder={tmp_path}",
+        *([] if name.startswith("table2") else ["artefacts=null"]),
+        "objects=[1]",
+        "max_images=1",
+        *(f"viewpoints.{setting}" for setting in count),
+        "crop.size=140",
+        "words.num_words=16",
+        "projection.num_components=16",
+        "trainer.accelerator=cpu",
+        *small_network(plain),
+    ]
+    record = run_once(load("ablate", *overrides), name)  # overrides that a user makes would end the row
+    assert record.status == "finished", record.error
+    assert record.row == (name if name.startswith("table") else None)
+    random = "weights" in plain.extractor
+    assert (record.label is not None) == random
+    assert record.figures["targets"] == 1
+    estimates = json.loads((next((tmp_path / "runs").iterdir()) / "estimates.json").read_text())
+    masks = 5 if plain.masks.get("masks_per_instance", 1) == 5 else 1
+    assert len(estimates) == min(masks, 2)  # there are two detections

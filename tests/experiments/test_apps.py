@@ -1,0 +1,299 @@
+import json
+import os
+import re
+import runpy
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from foundpose.bop import BopDataset, read_results
+from foundpose.geometry import rotation_angle
+from foundpose.synthetic import cluttered_scene, procedural_mesh
+from tests.bop_dataset import write_ply
+
+ROOT = Path(__file__).resolve().parents[2]
+# Small, but everything is in it.
+SMALL = ["viewpoints.count=60", "words.num_words=128", "projection.num_components=64"]
+
+
+def run_app(monkeypatch, name, *overrides):
+    """Run an app in this process as the command line would."""
+    monkeypatch.setattr(sys, "argv", [f"{name}.py", *overrides])
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
+    runpy.run_path(str(ROOT / "experiments" / f"{name}.py"), run_name="__main__")
+
+
+@pytest.fixture(scope="module")
+def own_picture(tmp_path_factory):
+    """A photograph, a mask and a mesh as files, and the truth.
+
+    The picture is one in which SIFT retrieves the right template, with the mask and with the box alike (with a box it
+    does so in about half of such pictures): what is tested here is the app, not the descriptor.
+    """
+    folder = tmp_path_factory.mktemp("own")
+    mesh = procedural_mesh(1, subdivisions=5)
+    scene = cluttered_scene(mesh, seed=51)
+    write_ply(folder / "cup.ply", mesh)
+    pixels = (scene.image * 255).round().byte().permute(1, 2, 0).numpy()
+    Image.fromarray(pixels).save(folder / "photo.png")
+    Image.fromarray(scene.mask.numpy()).save(folder / "mask.png")
+    K = scene.K
+    arguments = [
+        f"image={folder / 'photo.png'}",
+        f"mesh={folder / 'cup.ply'}",
+        f"intrinsics=[{K[0, 0]},{K[1, 1]},{K[0, 2]},{K[1, 2]}]",
+        "extractor=dense_sift",
+        "viewpoints.count=200",
+        "words.num_words=1024",
+        f"representations={folder / 'representations'}",
+    ]
+    return folder, scene, mesh, arguments
+
+
+def pose_error(output, scene, mesh):
+    facts = json.loads((output / "estimate.json").read_text())
+    T = scene.T_camera_from_model.double()
+    angle = torch.rad2deg(rotation_angle(torch.tensor(facts["R"]).double(), T[:3, :3]))
+    return float(angle), float((torch.tensor(facts["t"]) - T[:3, 3]).norm() / mesh.diameter)
+
+
+def test_own_picture_with_mask_box_and_distortion(own_picture, monkeypatch, tmp_path, capsys):
+    folder, scene, mesh, arguments = own_picture
+    run_app(
+        monkeypatch, "estimate", *arguments, f"mask={folder / 'mask.png'}", f"hydra.run.dir={tmp_path / 'a'}"
+    )
+    angle, distance = pose_error(tmp_path / "a", scene, mesh)
+    assert angle < 4
+    assert distance < 0.1
+    assert (tmp_path / "a" / "overlay.png").stat().st_size > 10_000
+    (line,) = read_results(tmp_path / "a" / "results.csv")
+    assert line.score > 0
+
+    # Another picture's result in the same folder would replace this one.
+    with pytest.raises(SystemExit):
+        run_app(monkeypatch, "estimate", *arguments, "box=[1,2,30,40]", f"hydra.run.dir={tmp_path / 'a'}")
+    assert "holds a run with other settings" in capsys.readouterr().err
+
+    rows, columns = torch.nonzero(scene.mask, as_tuple=True)
+    box = [
+        int(v)
+        for v in (columns.min(), rows.min(), columns.max() - columns.min() + 1, rows.max() - rows.min() + 1)
+    ]
+    run_app(monkeypatch, "estimate", *arguments, f"box={box}", f"hydra.run.dir={tmp_path / 'b'}")
+    angle, distance = pose_error(tmp_path / "b", scene, mesh)
+    assert angle < 6
+    assert distance < 0.15
+
+    # The same photograph through a lens: distort it with OpenCV's model, then let the app undo it.
+    K = scene.K.numpy().astype(np.float64)
+    coefficients = np.array([-0.28, 0.09, 0.001, -0.0015, 0.0])
+    height, width = scene.mask.shape
+    grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1).reshape(-1, 1, 2).astype(np.float64)
+    source = cv2.undistortPoints(grid, K, coefficients, P=K).reshape(height, width, 2).astype(np.float32)
+    for name in ("photo", "mask"):
+        picture = np.asarray(Image.open(folder / f"{name}.png").convert("RGB"))
+        bent = cv2.remap(picture, source[..., 0], source[..., 1], cv2.INTER_LINEAR)
+        Image.fromarray(bent).save(tmp_path / f"{name}.png")
+    run_app(
+        monkeypatch,
+        "estimate",
+        *arguments,
+        f"image={tmp_path / 'photo.png'}",
+        f"mask={tmp_path / 'mask.png'}",
+        f"distortion={coefficients.tolist()}",
+        f"hydra.run.dir={tmp_path / 'c'}",
+    )
+    angle, distance = pose_error(tmp_path / "c", scene, mesh)
+    assert angle < 5
+    assert distance < 0.12
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ([], "give either mask=… (a picture) or box=[x,y,width,height]"),
+        (["mask=none.png"], "no image at none.png"),
+        (["box=[1,2,3]"], "box must be [x,y,width,height], got [1, 2, 3]"),
+        (["intrinsics=null", "box=[1,2,3,4]"], "give intrinsics=… too"),
+        (["intrinsics=[600]", "box=[1,2,3,4]"], "intrinsics must be [fx,fy,cx,cy], got [600]"),
+        (["intrinsics=600", "box=[1,2,3,4]"], "intrinsics must be [fx,fy,cx,cy], got 600"),
+        (["intrinsics=[0,0,0,0]", "box=[1,2,3,4]"], "focal lengths must be positive, got fx=0.0, fy=0.0"),
+        (["box=5"], "box must be [x,y,width,height], got 5"),
+        (["box=[900,2,3,4]"], "holds no pixel of the image, which is 640x480 px"),
+        (["box=[1,2,30,40]", "device=gpu"], "device must be cpu, cuda, cuda:1 or mps, got 'gpu'"),
+        (["box=[1,2,30,40]", "extractor=dinov2_vits14", "extractor.layer=50"], "layer must be in 0..11"),
+        (["box=[1,2,30,40]", "projection.num_components=999"], "descriptors have 256 channels"),
+        (["mesh=none.ply", "box=[1,2,30,40]"], "none.ply"),
+        (
+            ["distortion=[0.1]", "box=[1,2,30,40]"],
+            "distortion must have 4, 5, 8, 12 or 14 coefficients, got 1",
+        ),
+        (["device=cuda", "box=[1,2,30,40]"], "use device=cpu"),
+    ],
+)
+def test_bad_input_is_one_clear_line(own_picture, monkeypatch, tmp_path, capsys, change, message):
+    _, _, _, arguments = own_picture
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    with pytest.raises(SystemExit) as stop:
+        run_app(monkeypatch, "estimate", *arguments, *change, f"hydra.run.dir={tmp_path}")
+    assert stop.value.code == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert lines[-1].startswith("error: ")
+    assert message in lines[-1]
+    assert not (tmp_path / "estimate.json").exists()
+
+
+def test_missing_weights_say_how_to_get_them(own_picture, monkeypatch, tmp_path, capsys):
+    _, _, _, arguments = own_picture
+    with pytest.raises(SystemExit) as stop:
+        run_app(
+            monkeypatch,
+            "estimate",
+            *arguments,
+            "box=[1,2,30,40]",
+            "extractor=dinov2_vits14_reg",
+            f"extractor.weights={tmp_path / 'dinov2_vits14_reg4_pretrain.pth'}",
+            f"hydra.run.dir={tmp_path}",
+        )
+    assert stop.value.code == 2
+    message = capsys.readouterr().err
+    assert "error: " in message
+    assert "dinov2_vits14_reg4_pretrain.pth" in message
+    assert "hf download" in message
+    assert "\\n" not in message
+
+
+def test_a_picture_without_a_pose_is_a_failure(own_picture, monkeypatch, tmp_path, capsys):
+    _, _, _, arguments = own_picture
+    # A single pixel is no region to look at.
+    with pytest.raises(SystemExit) as stop:
+        run_app(monkeypatch, "estimate", *arguments, "box=[5,5,1,1]", f"hydra.run.dir={tmp_path}")
+    assert stop.value.code == 1
+    assert "no pose was found: UNUSABLE_MASK" in capsys.readouterr().err
+    assert json.loads((tmp_path / "estimate.json").read_text())["valid"] is False
+    assert read_results(tmp_path / "results.csv") == []
+
+
+def bop_arguments(root, tmp_path):
+    return [
+        "experiment=oracle",
+        f"data.root={root}",
+        *SMALL,
+        f"representations={tmp_path / 'representations'}",
+        "overlays=0",
+    ]
+
+
+def test_bop_dataset_with_both_kinds_of_masks(tiny_bop, monkeypatch, tmp_path):
+    for masks in ("gt", "cnos"):
+        output = tmp_path / masks
+        arguments = bop_arguments(tiny_bop, tmp_path)
+        run_app(
+            monkeypatch, "estimate", *arguments, f"masks={masks}", f"hydra.run.dir={output}", "overlays=3"
+        )
+        results = read_results(output / "oracle_tiny-test.csv")
+        assert [(r.scene_id, r.im_id, r.obj_id) for r in results] == [(1, 0, 1), (1, 1, 2), (1, 2, 1)]
+        dataset = BopDataset(tiny_bop)
+        for result in results:
+            (truth,) = dataset.annotations(result.scene_id, result.im_id)
+            R = truth.T_camera_from_model[:3, :3]
+            assert torch.rad2deg(rotation_angle(result.T_camera_from_model[:3, :3], R)) < 3
+            assert result.time >= (0.25 if masks == "cnos" else 0)
+        assert [p.name for p in (output / "overlays").iterdir()] == ["000001_000000_000001_0.png"]
+
+
+def test_a_run_is_resumed_and_guarded(tiny_bop, monkeypatch, tmp_path, capsys):
+    output = tmp_path / "run"
+    arguments = [*bop_arguments(tiny_bop, tmp_path), f"hydra.run.dir={output}"]
+    run_app(monkeypatch, "estimate", *arguments, "max_images=2")
+    shards = sorted((output / "images").iterdir())
+    assert len(shards) == 2
+    before = [shard.stat().st_mtime_ns for shard in shards]
+    run_app(monkeypatch, "estimate", *arguments)
+    assert [shard.stat().st_mtime_ns for shard in shards] == before
+    assert len(read_results(output / "oracle_tiny-test.csv")) == 3
+    with pytest.raises(SystemExit):
+        run_app(monkeypatch, "estimate", *arguments, "pnp.iterations=50")
+    assert "holds a run with other settings" in capsys.readouterr().err
+
+
+def test_meshes_in_another_unit_and_unknown_objects_are_refused(tiny_bop, monkeypatch, tmp_path, capsys):
+    root = shutil.copytree(tiny_bop, tmp_path / "data")
+    info = {str(i): {"diameter": 0.12} for i in (1, 2)}
+    (root / "models" / "models_info.json").write_text(json.dumps(info))
+    arguments = [*bop_arguments(root, tmp_path), f"hydra.run.dir={tmp_path / 'run'}"]
+    for change, message in (
+        ([], "are they in the same unit?"),
+        (["objects=[7]"], "objects must be a list of ids from [1, 2]"),
+        (["objects=5"], "objects must be a list of ids from [1, 2]"),
+        ([f"data.root={tmp_path / 'nowhere'}"], "no BOP dataset at"),
+    ):
+        with pytest.raises(SystemExit) as stop:
+            run_app(monkeypatch, "estimate", *arguments, *change)
+        assert stop.value.code == 2
+        assert message in capsys.readouterr().err.strip().splitlines()[-1]
+
+
+def test_killed_onboarding_and_estimation_lose_nothing(tiny_bop, tmp_path):
+    """Kill the process at its first written file, start it again, and compare with a run left alone."""
+
+    def command(folder):
+        return [
+            sys.executable,
+            str(ROOT / "experiments" / "estimate.py"),
+            *bop_arguments(tiny_bop, folder),
+            f"hydra.run.dir={folder / 'run'}",
+        ]
+
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    victim, whole = tmp_path / "victim", tmp_path / "whole"
+    for pattern in ("representations/*.safetensors", "run/images/*.json"):
+        process = subprocess.Popen(command(victim), env=environment, stderr=subprocess.DEVNULL)
+        deadline = time.monotonic() + 120
+        while not list(victim.glob(pattern)):
+            assert process.poll() is None, "the run ended before it could be killed"
+            assert time.monotonic() < deadline
+            time.sleep(0.002)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        assert not (victim / "run" / "oracle_tiny-test.csv").exists()
+    for folder in (victim, whole):
+        subprocess.run(command(folder), env=environment, check=True, capture_output=True)
+    rows = [
+        [line.split(",")[:-1] for line in (folder / "run" / "oracle_tiny-test.csv").read_text().splitlines()]
+        for folder in (victim, whole)
+    ]
+    assert rows[0] == rows[1]
+    assert len(rows[0]) == 4
+
+
+def test_onboard_skips_what_is_there(tiny_bop, monkeypatch, tmp_path, capsys):
+    arguments = [
+        "experiment=oracle",
+        *SMALL,
+        f"representations={tmp_path}",
+        f"hydra.run.dir={tmp_path / 'log'}",
+    ]
+    run_app(monkeypatch, "onboard", *arguments, f"data.root={tiny_bop}", "objects=[2]")
+    out = capsys.readouterr().out
+    assert re.search(r"tiny-000002: onboarded in [\d.]+ s \(rendering [\d.]+ s, .*\), 60 templates", out)
+    run_app(monkeypatch, "onboard", *arguments, f"data.root={tiny_bop}")
+    out = capsys.readouterr().out
+    assert "tiny-000001: onboarded" in out
+    assert "tiny-000002: already there" in out
+    mesh = tiny_bop / "models" / "obj_000001.ply"
+    run_app(monkeypatch, "onboard", *arguments, f"mesh={mesh}")
+    assert "obj_000001: onboarded" in capsys.readouterr().out
+    assert len(list(tmp_path.glob("*.safetensors"))) == 3
+    with pytest.raises(SystemExit):
+        run_app(monkeypatch, "onboard", *arguments, "mesh=none.ply")
+    assert "error: " in capsys.readouterr().err
