@@ -4,9 +4,15 @@ from foundpose.features import DenseSift, DinoV2, FeatureHook, PatchExtractor, P
 from foundpose.geometry import PerspectiveCrop, SphereInplane, SuperFibonacci
 from foundpose.matching import PatchMatcher, SoftPatchMatcher
 from foundpose.onboarding import Onboarder, RepresentationStore
-from foundpose.pipeline import FoundPose
-from foundpose.pipeline.results import PoseEstimates, PoseStatus
-from foundpose.pipeline.verification import InlierScore, PatchVerification
+from foundpose.pipeline import (
+    FoundPose,
+    InlierScore,
+    MatchAndSolve,
+    PatchVerification,
+    PoseEstimates,
+    PoseStatus,
+    TemplateHypotheses,
+)
 from foundpose.pnp import GaussNewtonPnp, RansacPnp, SoftInlierSelection, TemplateStart, TopTemplatePose
 from foundpose.refinement import FeaturemetricRefiner, PoseRefiner, RefinerChain, RenderAndCompareRefiner
 from foundpose.rendering import Mesh, PyrenderRenderer, RaycastRenderer, load_mesh
@@ -31,6 +37,7 @@ __all__ = [
     "FoundPose",
     "GaussNewtonPnp",
     "InlierScore",
+    "MatchAndSolve",
     "Mesh",
     "ObjectRepresentation",
     "Onboarder",
@@ -55,6 +62,7 @@ __all__ = [
     "SpatialReranker",
     "SphereInplane",
     "SuperFibonacci",
+    "TemplateHypotheses",
     "TemplateRetriever",
     "TemplateStart",
     "TopTemplatePose",

@@ -18,8 +18,6 @@ GROUPS = sorted(
     (group.name, option.stem) for group in CONF.iterdir() if group.is_dir() for option in group.glob("*.yaml")
 )
 MODULES = {
-    "scorer",
-    "start",
     "renderer",
     "viewpoints",
     "words",
@@ -27,6 +25,9 @@ MODULES = {
     "retrieval",
     "matcher",
     "pnp",
+    "start",
+    "scorer",
+    "hypotheses",
     "crop",
     "pictures",
     "projection",

@@ -13,11 +13,15 @@ from benchmarking.workload import Workload, ellipsoid_mesh
 from foundpose.features import PatchExtractor
 from foundpose.geometry import PerspectiveCrop, rotation_angle
 from foundpose.matching import PatchMatcher, SoftPatchMatcher
-from foundpose.pipeline import FoundPose
-from foundpose.pipeline.foundpose import select_query_patches
-from foundpose.pipeline.results import PoseEstimates
-from foundpose.pipeline.verification import HypothesisScorer
-from foundpose.pnp import RansacPnp, TemplateStart, TopTemplatePose
+from foundpose.pipeline import (
+    FoundPose,
+    HypothesisScorer,
+    InlierScore,
+    MatchAndSolve,
+    PoseEstimates,
+    select_query_patches,
+)
+from foundpose.pnp import RansacPnp, TemplateStart
 from foundpose.refinement import PoseRefiner
 from foundpose.retrieval import Retriever, SpatialReranker, TemplateRetriever
 
@@ -42,17 +46,17 @@ class Stages(NamedTuple):
         pnp: estimates poses.
         refiner: refines poses; None leaves refinement out.
         epnp: another RANSAC that is only reported, with the paper's minimal solver; None leaves it out.
-        scorer: chooses among hypotheses; None: by inliers.
+        scorer: chooses among hypotheses.
         start: gives hypotheses beside RANSAC's; None: none.
     """
 
     crop: PerspectiveCrop
     retriever: Retriever
     matcher: PatchMatcher | SoftPatchMatcher
-    pnp: RansacPnp | TopTemplatePose
+    pnp: RansacPnp
     refiner: PoseRefiner | None
     epnp: RansacPnp | None = None
-    scorer: HypothesisScorer | None = None
+    scorer: HypothesisScorer = InlierScore()
     start: TemplateStart | None = None
 
     def pipeline(self, extractor: PatchExtractor, refine: Refine | None = None) -> FoundPose:
@@ -62,12 +66,9 @@ class Stages(NamedTuple):
             self.crop,
             extractor,
             self.retriever,
-            self.matcher,
-            self.pnp,
+            MatchAndSolve(self.matcher, self.pnp, self.scorer, self.start),
             refiner,
             refine or "best",
-            self.scorer,
-            self.start,
         ).eval()
 
 
@@ -141,7 +142,10 @@ def stage_inputs(
         "retriever": stages.retriever,
         "matcher": stages.matcher,
         "pnp": stages.pnp,
+        "scorer": stages.scorer,
     }
+    if stages.start is not None:
+        watched["start"] = stages.start
     kinds: list[tuple[str, Refine]] = [("refiner", "best")]
     if refine_all:
         kinds.append(("refiner of all", "all"))
@@ -202,19 +206,27 @@ def stage_tasks(
         candidates = partial(retriever, *inputs["retriever"])
         tasks.append(task("candidates for re-ranking", candidates, note="a part of retrieval"))
     tasks.append(task("retrieval", partial(stages.retriever, *inputs["retriever"])))
-    if isinstance(stages.pnp, RansacPnp):
-        tasks += [
-            task("template gather", partial(representation.gather_templates, coarse.templates.index)),
-            task("matching", partial(stages.matcher, *inputs["matcher"])),
-            task(
-                pnp_name(h),
-                partial(stages.pnp, *inputs["pnp"]),
-                facts={"solver": stages.pnp.solver, "patches": float(raw.valid.sum() / B)},
-            ),
-        ]
-        if stages.epnp is not None:
-            name = f"{pnp_name(h)}, epnp"
-            tasks.append(task(name, partial(stages.epnp, *inputs["pnp"]), note="reported only"))
+    tasks += [
+        task("template gather", partial(representation.gather_templates, coarse.templates.index)),
+        task("matching", partial(stages.matcher, *inputs["matcher"])),
+        task(
+            pnp_name(h),
+            partial(stages.pnp, *inputs["pnp"]),
+            facts={"solver": stages.pnp.solver, "patches": float(raw.valid.sum() / B)},
+        ),
+    ]
+    if stages.start is not None:
+        T = stages.start(*inputs["start"])
+
+        def polish() -> Any:
+            return stages.pnp.polish_starts(T.flatten(0, 1), *inputs["pnp"][:5])
+
+        tasks.append(task("templates' own poses", partial(stages.start, *inputs["start"])))
+        tasks.append(task("polish of the templates' poses", polish))
+    tasks.append(task("verification", partial(stages.scorer, *inputs["scorer"])))
+    if stages.epnp is not None:
+        name = f"{pnp_name(h)}, epnp"
+        tasks.append(task(name, partial(stages.epnp, *inputs["pnp"]), note="reported only"))
     if stages.refiner is not None:
         tasks.append(task(REFINE_ONE, partial(stages.refiner, *inputs["refiner"])))
         if refine_all:
@@ -277,25 +289,22 @@ def backward_tasks(
             return backbone(crops).patches
 
         tasks.append(task(f"{name}, w.r.t. images", partial(_gradient, describe, [crops])))
-    if isinstance(stages.pnp, RansacPnp):
-        soft = SoftPatchMatcher(5.0).to(crops.device)
-        query, query_valid, template, template_valid, pixels, points = inputs["matcher"][:6]
-        query, template = _leaf(query), _leaf(template)
+    soft = SoftPatchMatcher(5.0).to(crops.device)
+    query, query_valid, template, template_valid, pixels, points = inputs["matcher"][:6]
+    query, template = _leaf(query), _leaf(template)
 
-        def match() -> Tensor:
-            return soft(query, query_valid, template, template_valid, pixels, points).points_model
+    def match() -> Tensor:
+        return soft(query, query_valid, template, template_valid, pixels, points).points_model
 
-        tasks.append(
-            task("soft matching, w.r.t. both descriptors", partial(_gradient, match, [query, template]))
-        )
-        points_image, points_model, K, valid, weights, priority = inputs["pnp"]
-        leaves = [_leaf(points_image), _leaf(points_model), _leaf(weights)]
-        pnp = stages.pnp
+    tasks.append(task("soft matching, w.r.t. both descriptors", partial(_gradient, match, [query, template])))
+    points_image, points_model, K, valid, weights, priority = inputs["pnp"]
+    leaves = [_leaf(points_image), _leaf(points_model), _leaf(weights)]
+    pnp = stages.pnp
 
-        def solve() -> Tensor:
-            return pnp(leaves[0], leaves[1], K, valid, leaves[2], priority).T_camera_from_model
+    def solve() -> Tensor:
+        return pnp(leaves[0], leaves[1], K, valid, leaves[2], priority).T_camera_from_model
 
-        tasks.append(task(f"{pnp_name(h)}, w.r.t. points and weights", partial(_gradient, solve, leaves)))
+    tasks.append(task(f"{pnp_name(h)}, w.r.t. points and weights", partial(_gradient, solve, leaves)))
     if stages.refiner is not None:
         refiner = stages.refiner
         for name, key in ((REFINE_ONE, "refiner"), (refine_all_name(h), "refiner of all")):

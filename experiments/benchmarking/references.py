@@ -129,8 +129,6 @@ def inference_references(stages: Stages, workload: Workload) -> list[Reference]:
                 _same_indices("same_top"),
             )
         )
-    if not isinstance(stages.pnp, RansacPnp):
-        return references
     arguments = [_numpy(x) for x in inputs["matcher"][:4]]
     references.append(
         Reference(

@@ -15,8 +15,6 @@ from foundpose.evaluation.shards import BatchRecord, ShardWriter
 from foundpose.pipeline import FoundPose
 from foundpose.utils.timing import StageTimer
 
-_STAGES = ("crop", "extractor", "retriever", "matcher", "pnp", "refiner")
-
 
 class PoseEvaluation(pl.LightningModule):
     """Estimates the poses of :class:`PoseDataModule`'s batches and appends each finished batch to a shard.
@@ -101,8 +99,8 @@ class PoseEvaluation(pl.LightningModule):
         return records, time.perf_counter() - start
 
     def _stages(self) -> dict[str, nn.Module]:
-        stages = {name: getattr(self.pipeline, name) for name in _STAGES}
-        return {name: module for name, module in stages.items() if module is not None}
+        stages = dict(self.pipeline.named_children())
+        return stages | dict(self.pipeline.hypotheses.named_children())
 
 
 def estimate_dataset(trainer: pl.Trainer, module: PoseEvaluation, data: PoseDataModule) -> None:

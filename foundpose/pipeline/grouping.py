@@ -6,31 +6,74 @@ from typing import Any, TypeVar, cast
 import torch
 from torch import Tensor
 
+from foundpose.representation import ObjectRepresentation
+from foundpose.utils.devices import indices_on
+
 Fields = TypeVar("Fields", bound=tuple[Any, ...])
+Part = TypeVar("Part", bound=Tensor | tuple[Any, ...])
 
 
-def crops_of_objects(object_index: Tensor | None, count: int, num_objects: int) -> list[Tensor]:
-    """Crops of each object, as index tensors."""
-    if object_index is None:
-        if num_objects != 1:
-            raise ValueError(f"object_index (B,) is needed to tell {num_objects} objects apart")
-        return [torch.arange(count)]
+class ObjectGroups:
+    """Which crops of a batch show which object.
+
+    Args:
+        objects: representations.
+        object_index: (B,) which object each crop shows; may be None for a single object.
+        count: number B of crops.
+        device: where the crops are.
+
+    Raises:
+        ValueError: ``object_index`` does not fit.
+    """
+
+    def __init__(
+        self,
+        objects: Sequence[ObjectRepresentation],
+        object_index: Tensor | None,
+        count: int,
+        device: torch.device,
+    ) -> None:
+        if object_index is None and len(objects) != 1:
+            raise ValueError(f"object_index (B,) is needed to tell {len(objects)} objects apart")
+        if object_index is None:
+            labels, rows = torch.zeros(count, dtype=torch.int64), [torch.arange(count)]
+        else:
+            labels, rows = _members(object_index, count, len(objects))
+        self.objects = list(objects)
+        self.object_index = labels
+        self._groups = [
+            (obj, indices_on(device, members))
+            for obj, members in zip(objects, rows, strict=True)
+            if len(members) > 0
+        ]
+        self._back = indices_on(device, torch.cat(rows).argsort())
+
+    def map(self, function: Callable[[ObjectRepresentation, Tensor], Part]) -> Part:
+        """Call a function with each object that has crops and their indices; join what it says of them.
+
+        Returns:
+            Tensors, or a named tuple of tensors, in the order of the batch.
+        """
+        parts = [function(obj, rows) for obj, rows in self._groups]
+
+        def join(fields: list[Tensor]) -> Tensor:
+            return torch.cat(fields)[self._back]
+
+        if isinstance(parts[0], Tensor):
+            return cast(Part, join(cast(list[Tensor], parts)))
+        return cast(Part, combine(cast(list[tuple[Any, ...]], parts), join))
+
+
+def _members(object_index: Tensor, count: int, num_objects: int) -> tuple[Tensor, list[Tensor]]:
+    """The objects' numbers (B,) on the host, and the crops of each object."""
     if object_index.shape != (count,) or object_index.is_floating_point():
         raise ValueError(
             f"object_index must be ({count},) integers, got {tuple(object_index.shape)} {object_index.dtype}"
         )
-    labels = object_index.cpu()
+    labels = object_index.cpu().long()
     if count and (int(labels.min()) < 0 or int(labels.max()) >= num_objects):
         raise ValueError(f"object_index must lie in [0, {num_objects}), got {labels.tolist()}")
-    return [torch.nonzero(labels == i).flatten() for i in range(num_objects)]
-
-
-def object_of_each_crop(members: list[Tensor]) -> Tensor:
-    """(B,) from the crops of each object."""
-    index = torch.empty(sum(len(rows) for rows in members), dtype=torch.int64)
-    for i, rows in enumerate(members):
-        index[rows] = i
-    return index
+    return labels, [torch.nonzero(labels == i).flatten() for i in range(num_objects)]
 
 
 def take_rows(part: Fields, rows: Tensor) -> Fields:

@@ -3,11 +3,10 @@
 from enum import IntEnum
 from typing import NamedTuple
 
-import torch
 from torch import Tensor
 
 from foundpose.geometry import Crops
-from foundpose.pnp import PnpStatus, PoseCandidates, TemplatePoses
+from foundpose.pnp import PnpStatus, PoseCandidates
 from foundpose.refinement.base import RefinedPoses
 from foundpose.retrieval import QueryPatches, RetrievedTemplates
 
@@ -27,8 +26,6 @@ class PoseStatus(IntEnum):
 
 class Correspondences(NamedTuple):
     """2D-3D correspondences of B crops with h retrieved templates each.
-
-    Where poses are those of templates (:class:`foundpose.pnp.TopTemplatePose`) nothing is matched, and P is 0.
 
     Attributes:
         points_image: (B, P, 2) patch centres in the crop, pixels.
@@ -69,6 +66,20 @@ class PoseHypotheses(NamedTuple):
     score: Tensor
 
 
+class Hypothesised(NamedTuple):
+    """Pose hypotheses and what they were made from.
+
+    Attributes:
+        hypotheses: one for each crop and retrieved template.
+        correspondences: the matches; None where nothing was matched.
+        candidates: what a soft selection in the PnP stage chooses from; None without one.
+    """
+
+    hypotheses: PoseHypotheses
+    correspondences: Correspondences | None = None
+    candidates: PoseCandidates | None = None
+
+
 class PoseEstimates(NamedTuple):
     """Poses of a batch of crops, and what they were made from.
 
@@ -86,8 +97,8 @@ class PoseEstimates(NamedTuple):
         crops: the perspective crops.
         query: the crops' patches.
         templates: the retrieved templates.
-        correspondences: the matches.
         hypotheses: the poses of all retrieved templates.
+        correspondences: the matches; None where nothing was matched.
         candidates: with a soft selection in the PnP stage, the hypotheses of all templates and samples with the
             probability of choosing each (``T_camera_from_model`` (B, h · J, 4, 4)); None without.
         refined: what the refiner made of the hypotheses that it was given, in the crop's frame; None without.
@@ -103,34 +114,7 @@ class PoseEstimates(NamedTuple):
     crops: Crops
     query: QueryPatches
     templates: RetrievedTemplates
-    correspondences: Correspondences
     hypotheses: PoseHypotheses
+    correspondences: Correspondences | None = None
     candidates: PoseCandidates | None = None
     refined: RefinedPoses | None = None
-
-
-def no_correspondences(query: QueryPatches, templates: RetrievedTemplates) -> Correspondences:
-    """What stands where nothing was matched: no point of any crop."""
-    B, h = templates.index.shape
-    pixels = query.pixels
-    nothing = pixels.new_zeros(B, h, 0)
-    return Correspondences(
-        points_image=pixels.new_zeros(B, 0, 2),
-        points_model=pixels.new_zeros(B, h, 0, 3),
-        pixels_template=pixels.new_zeros(B, h, 0, 2),
-        distance=nothing,
-        weight=nothing,
-        valid=nothing.bool(),
-        priority=nothing,
-    )
-
-
-def template_hypotheses(poses: TemplatePoses, templates: RetrievedTemplates) -> PoseHypotheses:
-    """Aligned templates as hypotheses, as good as the templates are similar."""
-    return PoseHypotheses(
-        T_crop_from_model=poses.T_crop_from_model,
-        inliers=torch.zeros_like(templates.valid).unsqueeze(-1)[..., :0],
-        num_inliers=torch.zeros_like(poses.status),
-        status=poses.status.masked_fill(~templates.valid, int(PoseStatus.NO_TEMPLATE)),
-        score=templates.similarity,
-    )

@@ -6,8 +6,7 @@ import torch
 from torch import Tensor
 
 from foundpose.geometry import Crops, invert_transform
-from foundpose.pipeline.results import Correspondences, PoseEstimates, PoseHypotheses, PoseStatus
-from foundpose.pnp import PoseCandidates
+from foundpose.pipeline.results import Hypothesised, PoseEstimates, PoseHypotheses, PoseStatus
 from foundpose.refinement import PoseProposals, RefinedPoses
 from foundpose.retrieval import QueryPatches, RetrievedTemplates
 
@@ -18,11 +17,10 @@ def choose_coarse(
     crops: Crops,
     query: QueryPatches,
     templates: RetrievedTemplates,
-    correspondences: Correspondences,
-    hypotheses: PoseHypotheses,
-    candidates: PoseCandidates | None,
+    found: Hypothesised,
 ) -> PoseEstimates:
     """Keep the hypothesis with the best score; of equal ones, that of the more similar template."""
+    hypotheses = found.hypotheses
     solved = hypotheses.status == PoseStatus.OK
     best = _first_of_best(hypotheses.score.detach().masked_fill(~solved, -torch.inf)).squeeze(1)
     row = torch.arange(len(best), device=best.device)
@@ -43,9 +41,9 @@ def choose_coarse(
         crops=crops,
         query=query,
         templates=templates,
-        correspondences=correspondences,
         hypotheses=hypotheses,
-        candidates=candidates,
+        correspondences=found.correspondences,
+        candidates=found.candidates,
     )
 
 

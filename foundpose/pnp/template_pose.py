@@ -1,6 +1,6 @@
 """The pose of a retrieved template, moved to where the object is seen."""
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -9,6 +9,7 @@ from foundpose.geometry.cameras import pixel_rays, project_points
 from foundpose.geometry.circles import Circles, smallest_enclosing_circles
 from foundpose.geometry.transforms import make_transform, transform_points
 from foundpose.pnp.ransac import PnpStatus
+from foundpose.representation import ObjectRepresentation
 
 # The error falls about tenfold with each round.
 _ROUNDS = 5
@@ -19,22 +20,6 @@ _SMALLEST_RADIUS = 0.5
 # Extreme points of each template that are kept, and templates looked at together.
 _NUM_DIRECTIONS = 8
 _TEMPLATES_PER_BLOCK = 128
-
-
-class TemplateViews(Protocol):
-    """What is read of an object representation (all buffers on one device).
-
-    Attributes:
-        points_model: (M, 3) points of the patches of all templates, one template after another, mesh units.
-        template_offsets: (T + 1,) int64; template t owns points ``offsets[t]`` to ``offsets[t + 1]``.
-        max_patches: number of points of the largest template.
-        T_template_from_model: (T, 4, 4) poses of the object in the templates' cameras.
-    """
-
-    points_model: Tensor
-    template_offsets: Tensor
-    max_patches: int
-    T_template_from_model: Tensor
 
 
 class TemplatePoses(NamedTuple):
@@ -56,13 +41,13 @@ class TemplatePoses(NamedTuple):
 class TopTemplatePose(nn.Module):
     """Poses of the retrieved templates, moved so that the object's bounding circle is that of the mask.
 
-    It takes the place of :class:`RansacPnp` in :class:`foundpose.FoundPose`, which then matches no patches.
+    :class:`foundpose.TemplateHypotheses` uses it in place of matching and PnP.
 
     Source: paper, "Template retrieval", and Table 2, row 10.
     """
 
     def forward(
-        self, masks: Tensor, K: Tensor, template_index: Tensor, templates: TemplateViews
+        self, masks: Tensor, K: Tensor, template_index: Tensor, templates: ObjectRepresentation
     ) -> TemplatePoses:
         """Align the templates' poses with B crops of one object.
 
@@ -106,7 +91,7 @@ def mask_circles(masks: Tensor, dtype: torch.dtype) -> Circles:
     return smallest_enclosing_circles(ends.to(dtype), torch.cat([occupied, occupied], dim=1))
 
 
-def outline_points(templates: TemplateViews) -> Tensor:
+def outline_points(templates: ObjectRepresentation) -> Tensor:
     """Points of an object that are outermost in some template: (8 T, 3), mesh units.
 
     The patches of one template lie on a coarse grid, and those at the silhouette are left out: a circle around them

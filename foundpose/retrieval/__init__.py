@@ -1,6 +1,6 @@
 """Visual words, bags of words and template retrieval."""
 
-from foundpose.retrieval.base import QueryPatches, RetrievedTemplates, Retriever, TemplateIndex
+from foundpose.retrieval.base import QueryPatches, RetrievedTemplates, Retriever
 from foundpose.retrieval.bow import (
     BowNormalization,
     IdfMode,
@@ -23,7 +23,6 @@ __all__ = [
     "Retriever",
     "SoftAssignBow",
     "SpatialReranker",
-    "TemplateIndex",
     "TemplateRetriever",
     "VisualWords",
     "WordAssignment",

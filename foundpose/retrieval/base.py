@@ -1,13 +1,12 @@
 """What retrieval receives and returns, and the contract of retrievers."""
 
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-if TYPE_CHECKING:  # the representation's own module imports this package
-    from foundpose.representation.object_representation import RepresentationInfo, TemplatePatches
+from foundpose.representation import ObjectRepresentation
 
 
 class QueryPatches(NamedTuple):
@@ -24,34 +23,6 @@ class QueryPatches(NamedTuple):
     pixels: Tensor
     valid: Tensor
     cls: Tensor | None = None
-
-
-class TemplateIndex(Protocol):
-    """What retrievers read of an object representation (all buffers on one device); none reads all of it.
-
-    Attributes:
-        words: (k, d) visual words.
-        idf: (k,) inverse document frequencies, ``log(N / n_i)``.
-        template_bow: (T, k) bag-of-words descriptors of the templates, L2-normalised.
-        template_cls: (T, C) raw global descriptors of the templates, or None.
-        descriptors: (M, d) projected descriptors of the patches of all templates, one template after another.
-        template_offsets: (T + 1,) int64; template t owns patches ``offsets[t]`` to ``offsets[t + 1]``.
-        max_patches: number of patches of the largest template.
-        info: facts, the scales of the descriptors among them.
-    """
-
-    words: Tensor
-    idf: Tensor
-    template_bow: Tensor
-    template_cls: Tensor | None
-    descriptors: Tensor
-    template_offsets: Tensor
-    max_patches: int
-    info: "RepresentationInfo"
-
-    def gather_templates(self, index: Tensor, components: int | None = None) -> "TemplatePatches":
-        """Patches of templates, see :meth:`ObjectRepresentation.gather_templates`."""
-        ...
 
 
 class RetrievedTemplates(NamedTuple):
@@ -85,12 +56,12 @@ class Retriever(nn.Module, ABC):
         self.num_templates = num_templates
 
     @abstractmethod
-    def forward(self, query: QueryPatches, index: TemplateIndex) -> RetrievedTemplates:
+    def forward(self, query: QueryPatches, index: ObjectRepresentation) -> RetrievedTemplates:
         """Rank the templates of one object for a batch of crops.
 
         Args:
             query: patches of B crops.
-            index: templates of the object.
+            index: the object.
 
         Returns:
             The h most similar templates of each crop; a crop without valid patches has none.

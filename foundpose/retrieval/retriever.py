@@ -1,10 +1,10 @@
 """Retrieval of the templates that look most like a crop, by one descriptor for each."""
 
+from foundpose.representation import ObjectRepresentation
 from foundpose.retrieval.base import (
     QueryPatches,
     RetrievedTemplates,
     Retriever,
-    TemplateIndex,
     normalize_rows,
     select_templates,
 )
@@ -25,7 +25,7 @@ class TemplateRetriever(Retriever):
         super().__init__(num_templates)
         self.bow = bow
 
-    def forward(self, query: QueryPatches, index: TemplateIndex) -> RetrievedTemplates:
+    def forward(self, query: QueryPatches, index: ObjectRepresentation) -> RetrievedTemplates:
         """Rank the templates of one object for a batch of crops.
 
         Args:
@@ -67,7 +67,7 @@ class ClsRetriever(Retriever):
     Source: paper, "Template retrieval", and Table 2, rows 8 and 9.
     """
 
-    def forward(self, query: QueryPatches, index: TemplateIndex) -> RetrievedTemplates:
+    def forward(self, query: QueryPatches, index: ObjectRepresentation) -> RetrievedTemplates:
         """Rank the templates of one object for a batch of crops.
 
         Args:

@@ -6,11 +6,11 @@ import torch
 from torch import Tensor
 
 from foundpose.geometry.similarity import InPlane, fit_similarity_robustly, identity_similarity
+from foundpose.representation import ObjectRepresentation
 from foundpose.retrieval.base import (
     QueryPatches,
     RetrievedTemplates,
     Retriever,
-    TemplateIndex,
     normalize_rows,
 )
 
@@ -81,7 +81,7 @@ class SpatialReranker(Retriever):
         self.max_patches = max_patches
         self.components = components
 
-    def forward(self, query: QueryPatches, index: TemplateIndex) -> RetrievedTemplates:
+    def forward(self, query: QueryPatches, index: ObjectRepresentation) -> RetrievedTemplates:
         """Rank the templates of one object for a batch of crops.
 
         Args:
@@ -103,7 +103,9 @@ class SpatialReranker(Retriever):
         best = score.gather(1, kept)
         return RetrievedTemplates(found.index.gather(1, kept), best, found.valid.gather(1, kept))
 
-    def scores(self, query: QueryPatches, index: TemplateIndex, candidates: RetrievedTemplates) -> Tensor:
+    def scores(
+        self, query: QueryPatches, index: ObjectRepresentation, candidates: RetrievedTemplates
+    ) -> Tensor:
         """Scores (B, h) of candidates; −inf where not valid. Differentiable as :meth:`forward`."""
         query = _spread(query, self.max_patches)
         per_crop = candidates.index.shape[1] * max(index.max_patches, 1) * max(query.valid.shape[1], 1)
@@ -113,7 +115,7 @@ class SpatialReranker(Retriever):
         return torch.cat([candidates.similarity[:0], *parts])
 
     def _scores(
-        self, query: QueryPatches, index: TemplateIndex, candidates: RetrievedTemplates, rows: slice
+        self, query: QueryPatches, index: ObjectRepresentation, candidates: RetrievedTemplates, rows: slice
     ) -> Tensor:
         """Scores of some of the crops."""
         valid = query.valid[rows]

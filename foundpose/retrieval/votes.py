@@ -1,30 +1,20 @@
 """Retrieval by direct matching of patches: every patch of the crop is compared with every patch of all templates."""
 
 from collections.abc import Callable
-from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
+from foundpose.representation import ObjectRepresentation
 from foundpose.retrieval.base import (
     QueryPatches,
     RetrievedTemplates,
     Retriever,
-    TemplateIndex,
     normalize_rows,
     select_templates,
 )
 
 _TEMPLATES_PER_BLOCK = 16
-
-
-@runtime_checkable
-class ReadsDescriptors(Protocol):
-    """A template index that may keep descriptors as codes, such as an object representation."""
-
-    def read_descriptors(self, rows: Tensor) -> Tensor:
-        """Descriptors (..., d) of patches (...)."""
-        ...
 
 
 class PatchVoteRetriever(Retriever):
@@ -47,7 +37,7 @@ class PatchVoteRetriever(Retriever):
             raise ValueError(f"chunk must be at least 1, got {chunk}")
         self.chunk = chunk
 
-    def forward(self, query: QueryPatches, index: TemplateIndex) -> RetrievedTemplates:
+    def forward(self, query: QueryPatches, index: ObjectRepresentation) -> RetrievedTemplates:
         """Rank the templates of one object for a batch of crops.
 
         Args:
@@ -66,7 +56,7 @@ class PatchVoteRetriever(Retriever):
         """
         _check(query, index)
         x = query.descriptors.masked_fill(~query.valid.unsqueeze(-1), 0.0)
-        read = _reader(index)
+        read = index.read_descriptors
         similarity = template_similarities(
             x.detach(),
             query.valid,
@@ -137,16 +127,13 @@ def template_similarities(
     return mean.masked_fill(empty, -torch.inf)
 
 
-def _similarity_of(templates: Tensor, x: Tensor, valid: Tensor, index: TemplateIndex) -> Tensor:
+def _similarity_of(templates: Tensor, x: Tensor, valid: Tensor, index: ObjectRepresentation) -> Tensor:
     """Similarities (B, h) of crops (B, P, d) to a few templates (B, h) of each, with a graph."""
-    patches = _patches_of(templates, index.max_patches, _reader(index), index.template_offsets, x.dtype)
+    patches = _patches_of(
+        templates, index.max_patches, index.read_descriptors, index.template_offsets, x.dtype
+    )
     best = torch.einsum("bpd,bhqd->bhpq", normalize_rows(x), patches).amax(dim=3)
     return (best * valid.unsqueeze(1)).sum(dim=2) / valid.sum(dim=1, keepdim=True).clamp(min=1)
-
-
-def _reader(index: TemplateIndex) -> Callable[[Tensor], Tensor]:
-    """What returns rows of an object's descriptors."""
-    return index.read_descriptors if isinstance(index, ReadsDescriptors) else index.descriptors.__getitem__
 
 
 def _patches_of(
@@ -162,7 +149,7 @@ def _patches_of(
     return normalize_rows(read(torch.minimum(rows, offsets[-1] - 1)).to(dtype))
 
 
-def _check(query: QueryPatches, index: TemplateIndex) -> None:
+def _check(query: QueryPatches, index: ObjectRepresentation) -> None:
     if query.descriptors.ndim != 3 or query.valid.shape != query.descriptors.shape[:2]:
         raise ValueError(
             "query.descriptors and query.valid must have shapes (B, P, d) and (B, P), got "

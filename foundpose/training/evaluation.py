@@ -17,7 +17,6 @@ from foundpose.pipeline import FoundPose
 from foundpose.rendering import Mesh, Renderer
 from foundpose.representation import ObjectRepresentation
 from foundpose.retrieval import QueryPatches, RetrievedTemplates
-from foundpose.retrieval.base import TemplateIndex
 from foundpose.synthetic import LightVariation, cluttered_scene
 
 RIGHT_DEGREES = 10.0
@@ -52,7 +51,7 @@ class GivenTemplates(nn.Module):
         super().__init__()
         self.index = torch.zeros(0, 1, dtype=torch.int64)
 
-    def forward(self, query: QueryPatches, index: TemplateIndex) -> RetrievedTemplates:
+    def forward(self, query: QueryPatches, index: ObjectRepresentation) -> RetrievedTemplates:
         """The given templates, all equally similar."""
         if len(self.index) != len(query.valid):
             raise ValueError(f"templates are given for {len(self.index)} crops, there are {len(query.valid)}")
@@ -97,8 +96,7 @@ def evaluate_scenes(
             pipeline.crop,
             pipeline.extractor,
             given,  # type: ignore[arg-type]  # it stands in for a retriever
-            pipeline.matcher,
-            pipeline.pnp,
+            pipeline.hypotheses,
             pipeline.refiner,
             pipeline.refine,
         ).eval()

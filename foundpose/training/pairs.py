@@ -14,7 +14,7 @@ from torch import Tensor
 from foundpose.features import PatchFeatures
 from foundpose.geometry import PerspectiveCrop, Symmetries
 from foundpose.onboarding import Onboarder, Progress
-from foundpose.pipeline.foundpose import select_query_patches
+from foundpose.pipeline import select_query_patches
 from foundpose.rendering import Mesh
 from foundpose.synthetic import LightVariation, combine_seeds
 from foundpose.training.views import nearby_rotations, render_crops, render_templates

@@ -10,7 +10,7 @@ from matplotlib.lines import Line2D
 from torch import Tensor
 
 from foundpose.geometry import project_points, transform_points
-from foundpose.pipeline.results import PoseEstimates, PoseStatus
+from foundpose.pipeline.results import Correspondences, PoseEstimates, PoseStatus
 from foundpose.rendering import Mesh, Renderer
 from foundpose.representation import ObjectRepresentation
 from foundpose.utils.files import write_atomically
@@ -102,7 +102,8 @@ def save_estimate_figure(
         inliers = int(e.hypotheses.num_inliers[index, rank])
         similarity = float(e.templates.similarity[index, rank])
         _show(axes, views[rank], f"{similarity:.2f}, {inliers} inliers" + (" (best)" if rank == best else ""))
-    _show_matches(bottom.subplots(1, 1), estimates, index, best, views[best])
+    if e.correspondences is not None:
+        _show_matches(bottom.subplots(1, 1), e, e.correspondences, index, views[best])
     write_atomically(Path(path), lambda temporary: figure.savefig(temporary, dpi=70))
 
 
@@ -123,7 +124,9 @@ def _look_closer(axes: Axes, K: Tensor, mesh: Mesh, poses: list[Tensor]) -> None
     axes.set_ylim(v + half, v - half)
 
 
-def _show_matches(axes: Axes, e: PoseEstimates, index: int, best: int, template: Tensor) -> None:
+def _show_matches(
+    axes: Axes, e: PoseEstimates, matches: Correspondences, index: int, template: Tensor
+) -> None:
     """Crop and template side by side, joined by the inlier matches."""
     size = template.shape[-1]
     _show(
@@ -131,10 +134,11 @@ def _show_matches(axes: Axes, e: PoseEstimates, index: int, best: int, template:
         torch.cat([e.crops.images[index].cpu(), template], dim=-1),
         "inlier matches of the best template",
     )
+    best = int(e.best[index])
     inliers = torch.nonzero(e.hypotheses.inliers[index, best].cpu()).flatten()
     inliers = inliers[:: max(1, len(inliers) // _MOST_LINES)]
-    start = e.correspondences.points_image[index].cpu()[inliers]
-    end = e.correspondences.pixels_template[index, best].cpu()[inliers] + torch.tensor([float(size), 0.0])
+    start = matches.points_image[index].cpu()[inliers]
+    end = matches.pixels_template[index, best].cpu()[inliers] + torch.tensor([float(size), 0.0])
     lines = torch.stack([start, end], dim=1).numpy()
     hues = torch.linspace(0, 1, max(len(lines), 1)).numpy()
     axes.add_collection(LineCollection(list(lines), array=hues, cmap="hsv", linewidths=0.8))

@@ -5,7 +5,14 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from foundpose import FoundPose, PatchVerification, PoseStatus, TemplateStart
+from foundpose import (
+    FoundPose,
+    MatchAndSolve,
+    PatchVerification,
+    PoseStatus,
+    TemplateHypotheses,
+    TemplateStart,
+)
 from foundpose.evaluation.records import pose_records
 from foundpose.features import CoordinateCode, DinoV2, PatchNoise, PcaProjection
 from foundpose.geometry import (
@@ -19,7 +26,7 @@ from foundpose.geometry import (
 from foundpose.losses import PointMatchingLoss
 from foundpose.matching import PatchMatcher, SoftPatchMatcher
 from foundpose.onboarding import Onboarder
-from foundpose.pnp import GaussNewtonPnp, RansacPnp, SoftInlierSelection, TopTemplatePose
+from foundpose.pnp import GaussNewtonPnp, RansacPnp, SoftInlierSelection
 from foundpose.refinement import FeaturemetricRefiner
 from foundpose.rendering import CoordinateRenderer, RaycastRenderer
 from foundpose.rendering.coordinates import render_coordinate_image
@@ -44,9 +51,10 @@ def make_pipeline(extractor=None, **changes):
         "crop": PerspectiveCrop(),
         "extractor": extractor or CoordinateCode(),
         "retriever": TemplateRetriever(SoftAssignBow()),
-        "matcher": PatchMatcher(),
-        "pnp": RansacPnp(),
     }
+    solving = {"matcher": PatchMatcher(), "pnp": RansacPnp()}
+    solving |= {name: changes.pop(name) for name in ("matcher", "pnp", "scorer", "start") if name in changes}
+    settings |= {"hypotheses": MatchAndSolve(**solving)}
     return FoundPose(**(settings | changes)).eval()
 
 
@@ -390,7 +398,10 @@ def test_cls_tokens_retrieve(blob):
     T, intrinsics = representation.T_template_from_model[:6], representation.K_template[:6]
     render = RaycastRenderer()(blob, T, intrinsics, (420, 420))
     pipeline = make_pipeline(
-        extractor, retriever=ClsRetriever(3), crop=PerspectiveCrop(background="black"), pnp=TopTemplatePose()
+        extractor,
+        retriever=ClsRetriever(3),
+        crop=PerspectiveCrop(background="black"),
+        hypotheses=TemplateHypotheses(),
     )
     with torch.no_grad(), warnings.catch_warnings():
         warnings.simplefilter("error")  # a bag of words is nothing that this retriever relies on
@@ -418,13 +429,13 @@ def oracle_of(blob):
 
 
 def test_pose_of_the_top_template(scene, oracle_blob, blob):
-    pipeline = make_pipeline(pnp=TopTemplatePose(), retriever=NearestTemplates(scene), matcher=None)
+    pipeline = make_pipeline(hypotheses=TemplateHypotheses(), retriever=NearestTemplates(scene))
     e = estimate_scene(pipeline, scene, oracle_blob)
     assert e.valid.all()
     assert (e.best == 0).all()
     assert torch.equal(e.score, e.templates.similarity[:, 0])
     assert (e.num_inliers == 0).all()
-    assert e.correspondences.points_model.shape == (2, 5, 0, 3)
+    assert e.correspondences is None
     assert e.hypotheses.inliers.shape == (2, 5, 0)
     angle, _ = errors(e, scene[2])
     # As far off as the nearest template, and not farther.
@@ -439,7 +450,7 @@ def test_pose_of_the_top_template(scene, oracle_blob, blob):
 
 @pytest.mark.parametrize("refine", ["best", "all"])
 def test_pose_of_a_template_is_a_start_for_refiners(scene, oracle_blob, refine):
-    settings = {"pnp": TopTemplatePose(), "retriever": NearestTemplates(scene), "refine": refine}
+    settings = {"hypotheses": TemplateHypotheses(), "retriever": NearestTemplates(scene), "refine": refine}
     coarse = estimate_scene(make_pipeline(**settings), scene, oracle_blob)
     refined = estimate_scene(make_pipeline(**settings, refiner=FeaturemetricRefiner()), scene, oracle_blob)
     assert refined.refined.valid.all()
@@ -457,7 +468,7 @@ def test_poses_of_templates_alone_as_in_a_batch_and_unusable_masks(scene, oracle
     thin[1, 100, 100:400] = True
     all_masks = torch.cat([masks[:1], thin, masks[1:], masks[1:]])
     which = torch.tensor([0, 0, 0, 1, 0])
-    pipeline = make_pipeline(pnp=TopTemplatePose())
+    pipeline = make_pipeline(hypotheses=TemplateHypotheses())
     with torch.no_grad():
         batch = pipeline(
             image[None],
@@ -498,13 +509,15 @@ class NothingFound(Retriever):
 
 def test_no_template(scene, oracle_blob):
     e = estimate_scene(
-        make_pipeline(pnp=TopTemplatePose(), retriever=NothingFound(False)), scene, oracle_blob
+        make_pipeline(hypotheses=TemplateHypotheses(), retriever=NothingFound(False)), scene, oracle_blob
     )
     assert (e.status == PoseStatus.NO_TEMPLATE).all()
     assert not e.valid.any()
     assert (e.score == 0).all()
     assert torch.isfinite(e.T_camera_from_model).all()
-    e = estimate_scene(make_pipeline(pnp=TopTemplatePose(), retriever=NothingFound(True)), scene, oracle_blob)
+    e = estimate_scene(
+        make_pipeline(hypotheses=TemplateHypotheses(), retriever=NothingFound(True)), scene, oracle_blob
+    )
     assert e.valid.all()
     assert e.hypotheses.status.tolist() == [[PoseStatus.OK, PoseStatus.NO_TEMPLATE]] * 2
 
@@ -512,7 +525,7 @@ def test_no_template(scene, oracle_blob):
 def test_gradients_of_a_templates_pose_reach_the_camera(scene, oracle_blob):
     image, masks, T_true = scene
     camera = K[None].clone().requires_grad_()
-    e = make_pipeline(pnp=TopTemplatePose())(image[None], camera, oracle_blob, masks=masks[:1])
+    e = make_pipeline(hypotheses=TemplateHypotheses())(image[None], camera, oracle_blob, masks=masks[:1])
     ((e.T_camera_from_model - T_true[:1])[:, :3] ** 2).sum().backward()
     assert torch.isfinite(camera.grad).all()
     # A longer focal length puts the object farther away.

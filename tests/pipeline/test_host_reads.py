@@ -11,7 +11,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 import foundpose
 from benchmarking import ScriptedExtractor, Workload, WorkloadSizes, make_workload
-from foundpose import FoundPose
+from foundpose import FoundPose, MatchAndSolve
 from foundpose.geometry import PerspectiveCrop
 from foundpose.matching import PatchMatcher
 from foundpose.pnp import RansacPnp
@@ -25,7 +25,7 @@ MAY_READ = {
     "optimization/levenberg_marquardt.py:levenberg_marquardt",
     "pnp/sampling.py:sample_hypotheses",
     "pnp/ransac.py:_climb",
-    "pipeline.py:select_query_patches",
+    "pipeline/query.py:select_query_patches",
 }
 READS = {"_local_scalar_dense", "nonzero", "masked_select", "equal", "is_nonzero", "_unique2"}
 ON_THE_HOST = {"refinement/refiners.py:alignment_problem"}  # an index that is there already
@@ -61,8 +61,7 @@ def pipeline(workload: Workload) -> FoundPose:
         PerspectiveCrop(workload.sizes.crop_size, workload.sizes.fill),
         ScriptedExtractor(workload.sizes, workload.features),
         TemplateRetriever(SoftAssignBow()),
-        PatchMatcher(),
-        RansacPnp(),
+        MatchAndSolve(PatchMatcher(), RansacPnp()),
         FeaturemetricRefiner(),
         "all",
     )
@@ -87,7 +86,7 @@ def test_only_loops_ask_whether_to_go_on() -> None:
         estimates = run(method, workload)
     assert estimates.valid.all()
     assert set(reads.places) - ON_THE_HOST == MAY_READ
-    assert reads.places["pipeline.py:select_query_patches"] == 1
+    assert reads.places["pipeline/query.py:select_query_patches"] == 1
 
 
 def test_the_counter_sees_reads() -> None:

@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch import nn
 
-from foundpose import FoundPose
+from foundpose import FoundPose, MatchAndSolve
 from foundpose.features import CoordinateCode
 from foundpose.geometry import PerspectiveCrop, intrinsics_matrix, make_transform, rotation_angle
 from foundpose.matching import PatchMatcher
@@ -28,8 +28,7 @@ def test_chain_in_the_pipeline(blob, oracle_blob, refine_what):
             PerspectiveCrop(),
             CoordinateCode(),
             TemplateRetriever(SoftAssignBow(), num_templates=2),
-            PatchMatcher(),
-            RansacPnp(),
+            MatchAndSolve(PatchMatcher(), RansacPnp()),
             refiner,
             refine_what,
         ).eval()

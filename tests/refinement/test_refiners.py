@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from foundpose import FoundPose, PoseStatus
+from foundpose import FoundPose, MatchAndSolve, PoseStatus
 from foundpose.features import CoordinateCode
 from foundpose.geometry import PerspectiveCrop, rotation_angle
 from foundpose.matching import PatchMatcher
@@ -28,8 +28,7 @@ def make_pipeline(**changes) -> FoundPose:
         "crop": PerspectiveCrop(),
         "extractor": CoordinateCode(),
         "retriever": TemplateRetriever(SoftAssignBow()),
-        "matcher": PatchMatcher(),
-        "pnp": RansacPnp(),
+        "hypotheses": MatchAndSolve(PatchMatcher(), RansacPnp()),
     }
     return FoundPose(**parts | changes)
 

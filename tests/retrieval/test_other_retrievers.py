@@ -19,6 +19,9 @@ class Index(NamedTuple):
     max_patches: int
     template_cls: Tensor | None
 
+    def read_descriptors(self, rows: Tensor) -> Tensor:
+        return self.descriptors[rows]
+
 
 COUNTS = [5, 17, 0, 1, 30, 12, 17, 3, 8, 25, 11, 2, 9, 14, 21, 6, 0, 19, 7, 4]
 

@@ -6,7 +6,7 @@ import torch
 from foundpose.geometry import PerspectiveCrop, make_transform, symmetries_from_models_info
 from foundpose.geometry.symmetries import axis_rotation
 from foundpose.matching import PatchMatcher
-from foundpose.pipeline import FoundPose
+from foundpose.pipeline import FoundPose, MatchAndSolve
 from foundpose.pnp import RansacPnp
 from foundpose.retrieval import QueryPatches, TemplateRetriever
 from foundpose.training import PoseErrors, compare, evaluate_scenes, summarize
@@ -102,8 +102,7 @@ def test_scenes_with_retrieved_and_with_nearest_templates(bodies, sift_onboarder
         PerspectiveCrop(280),
         sift_onboarder.extractor,
         TemplateRetriever(sift_onboarder.bow, 2),
-        PatchMatcher(),
-        RansacPnp(iterations=100),
+        MatchAndSolve(PatchMatcher(), RansacPnp(iterations=100)),
     ).train()
     pipeline.extractor.eval()
     modes = [part.training for part in pipeline.modules()]

@@ -9,7 +9,7 @@ from benchmarking import ScriptedExtractor, WorkloadSizes, make_workload, subset
 from benchmarking.onboarding import raw_descriptors
 from benchmarking.workload import SEMI_AXES, ellipsoid_mesh
 from foundpose.geometry import PerspectiveCrop, project_points, rotation_angle, transform_points
-from foundpose.pipeline.foundpose import select_query_patches
+from foundpose.pipeline import select_query_patches
 from foundpose.retrieval import SoftAssignBow, TemplateRetriever
 
 SIZES = WorkloadSizes(
