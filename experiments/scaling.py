@@ -7,6 +7,7 @@ python experiments/scaling.py
 python experiments/scaling.py counts=[10,100] storages=[int8,pq64]
 """
 
+import copy
 import ctypes
 import gc
 import os
@@ -41,9 +42,6 @@ _MIB = 2**20
 _GIB = 2**30
 _STATUS = Path("/proc/self/status")
 _CROPS_PREPARED = 8
-
-
-_RECORDED = ("counts", "crops", "sizes")
 
 
 @dataclass(frozen=True)
@@ -123,9 +121,10 @@ def main(cfg: DictConfig) -> None:
     """Measure, write ``scaling.json``, ``scaling.md`` and ``scaling.png``, and print the table."""
     folder = Path(HydraConfig.get().runtime.output_dir)
     with clear_errors():
+        cfg = prepared(cfg)
         rows = measure(cfg, folder / "objects" if cfg.files is None else Path(cfg.files))
         content = {
-            "settings": {k: OmegaConf.to_object(cfg[k]) if k != "crops" else cfg.crops for k in _RECORDED},
+            "settings": OmegaConf.to_container(cfg, resolve=True),
             "hardware": describe_hardware(torch.device("cpu")),
             "versions": describe_versions(),
             "rows": [asdict(row) for row in rows],
@@ -139,6 +138,17 @@ def main(cfg: DictConfig) -> None:
         print(f"{text}\n{folder}")
 
 
+def prepared(cfg: DictConfig) -> DictConfig:
+    """A copy of the settings in which the crops are those that the workload's descriptors belong to."""
+    cfg = copy.deepcopy(cfg)
+    cfg.crop.fill = _sizes(cfg).fill
+    return cfg
+
+
+def _sizes(cfg: DictConfig) -> WorkloadSizes:
+    return WorkloadSizes(**cfg.sizes, batch_size=_CROPS_PREPARED, images=_CROPS_PREPARED)
+
+
 def measure(cfg: DictConfig, files: Path) -> list[Row]:
     """Rows of all storages and numbers of objects."""
     counts = sorted(cfg.counts)
@@ -146,14 +156,12 @@ def measure(cfg: DictConfig, files: Path) -> list[Row]:
         raise ValueError(f"counts and crops must be at least 1, got {list(cfg.counts)} and {cfg.crops}")
     if not _STATUS.is_file():
         raise ValueError(f"resident memory is read from {_STATUS}, which this system does not have")
-    sizes = WorkloadSizes(**cfg.sizes, batch_size=_CROPS_PREPARED, images=_CROPS_PREPARED)
-    cfg.crop.fill = sizes.fill
-    workload = make_workload(sizes)
+    workload = make_workload(_sizes(cfg))
     crops = Crops(cfg, workload)
     crops.seconds(0, workload.representation)  # whatever is done once
     rows = []
     for name in cfg.storages:
-        storage, subspaces = parse_storage(name)
+        storage, subspaces = parse_storage(name, cfg.onboarder.pq_subspaces)
         stored = workload.representation.with_storage(storage, subspaces)
         with distinct_files(stored, files, counts, cfg.disk_limit, name) as paths:
             fitting = [count for count in counts if count <= len(paths)]
@@ -165,11 +173,11 @@ def measure(cfg: DictConfig, files: Path) -> list[Row]:
     return rows
 
 
-def parse_storage(name: str) -> tuple[Storage, int]:
-    """Storage and number of subspaces of a name such as ``int8`` or ``pq32``."""
+def parse_storage(name: str, subspaces: int) -> tuple[Storage, int]:
+    """Storage and number of subspaces of a name such as ``int8`` or ``pq32``; of ``pq`` alone as many as given."""
     if name.startswith("pq") and name[2:].isdecimal():
         return "pq", int(name[2:])
-    return cast(Storage, name), 1
+    return cast(Storage, name), subspaces
 
 
 @contextmanager

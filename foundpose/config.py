@@ -4,6 +4,8 @@ import difflib
 import json
 import os
 import sys
+import sysconfig
+import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -136,13 +138,33 @@ def claim_run_folder(folder: Path, cfg: DictConfig, ignore: tuple[str, ...]) -> 
 
 @contextmanager
 def clear_errors() -> Iterator[None]:
-    """Turn bad input into one line on standard error and exit status 2; HYDRA_FULL_ERROR=1 shows where it arose."""
+    """Turn bad input into a line on standard error and exit status 2; HYDRA_FULL_ERROR=1 shows where it arose.
+
+    Bad input is what this library or an app refuses. A ``ValueError`` from elsewhere is a mistake
+    in a program, and goes on with its traceback.
+    """
     try:
         yield
     except (ValueError, FileNotFoundError, RendererNotAvailableError, InstantiationException) as error:
-        if os.environ.get("HYDRA_FULL_ERROR") == "1":
-            raise
         # Hydra wraps what a constructor raises.
-        cause = error.__cause__ if isinstance(error, InstantiationException) and error.__cause__ else error
-        print(f"error: {cause}", file=sys.stderr)
+        wrapped = isinstance(error, InstantiationException) and error.__cause__ is not None
+        cause = error.__cause__ if wrapped else error
+        assert cause is not None
+        if os.environ.get("HYDRA_FULL_ERROR") == "1" or not _is_refusal(cause):
+            raise
+        print(f"error: {cause} (HYDRA_FULL_ERROR=1 shows where)", file=sys.stderr)
         sys.exit(2)
+
+
+def _is_refusal(error: BaseException) -> bool:
+    """Whether an error says that the input is bad."""
+    if not isinstance(error, ValueError) or isinstance(error, json.JSONDecodeError):
+        return True
+    if error.__traceback__ is None:
+        return True
+    *_, (frame, _) = traceback.walk_tb(error.__traceback__)
+    file = Path(frame.f_code.co_filename).resolve()
+    if file.is_relative_to(Path(__file__).resolve().parent):
+        return True
+    others = (sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib"))
+    return not any(file.is_relative_to(Path(folder).resolve()) for folder in others)

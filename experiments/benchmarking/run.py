@@ -87,11 +87,11 @@ def run_benchmark(cfg: DictConfig, folder: Path, progress: Progress) -> Benchmar
     if "references" in cfg.groups:
         references = inference_references(stages, workload)
         if cfg.references.kmeans:
-            descriptors = workload.representation.projection.float()(raw_descriptors(workload))
+            projection = copy.deepcopy(workload.representation.projection).float()
+            descriptors = projection(raw_descriptors(workload))
             references.append(
                 kmeans_reference(descriptors, method.onboarder.words, cfg.references.kmeans_iterations)
             )
-            workload.representation.projection.to(_DTYPES[cfg.dtype])
         result.comparisons = run_references(references, device, settings, progress)
     if "curves" in cfg.groups:
         values = {name: list(xs or []) for name, xs in cfg.curves.items()}

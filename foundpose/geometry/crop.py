@@ -3,12 +3,13 @@
 from typing import Literal, NamedTuple, get_args
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from foundpose.geometry.boxes import boxes_from_masks, masks_from_boxes
 from foundpose.geometry.cameras import camera_on_boxes
 from foundpose.geometry.warp import sample_pixels, sample_pyramids, warped_pixels
 from foundpose.utils.devices import constant, indices_on
+from foundpose.utils.settings import Configured, Setting
 
 Background = Literal["keep", "black"]
 
@@ -36,7 +37,7 @@ class Crops(NamedTuple):
     valid: Tensor
 
 
-class PerspectiveCrop(nn.Module):
+class PerspectiveCrop(Configured):
     """Warps image regions to virtual pinhole cameras (paper, "Perspective cropping").
 
     The axis of a virtual camera passes through the centre of the mask's 2D box and the longer side of the warped
@@ -71,6 +72,16 @@ class PerspectiveCrop(nn.Module):
         self.antialias = antialias
         self.min_box_size = min_box_size
         self.background: Background = background
+
+    def settings(self) -> dict[str, Setting]:
+        """Settings by name."""
+        return {
+            "size": self.size,
+            "fill": self.fill,
+            "antialias": self.antialias,
+            "min_box_size": self.min_box_size,
+            "background": self.background,
+        }
 
     def forward(
         self,

@@ -4,7 +4,9 @@ import math
 
 import torch
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
-from torch import Tensor, nn
+from torch import Tensor
+
+from foundpose.utils.settings import Configured, Setting
 
 # The spiral's two irrational steps: sqrt(2) and the positive root of psi^4 = psi + 4 (Alexa 2022).
 _PHI = math.sqrt(2.0)
@@ -69,7 +71,7 @@ def sphere_inplane_rotations(num_views: int = 57, num_inplane: int = 14) -> Tens
     return (R_inplane[None] @ R_views[:, None]).reshape(-1, 3, 3)
 
 
-class SuperFibonacci(nn.Module):
+class SuperFibonacci(Configured):
     """Orientations on super-Fibonacci spirals; see :func:`super_fibonacci_rotations`.
 
     Args:
@@ -84,12 +86,12 @@ class SuperFibonacci(nn.Module):
         """Rotations (count, 3, 3), float64."""
         return super_fibonacci_rotations(self.count)
 
-    def extra_repr(self) -> str:
-        """Settings, for printing."""
-        return f"count={self.count}"
+    def settings(self) -> dict[str, Setting]:
+        """Settings by name."""
+        return {"count": self.count}
 
 
-class SphereInplane(nn.Module):
+class SphereInplane(Configured):
     """View directions times in-plane rotations; see :func:`sphere_inplane_rotations`.
 
     Args:
@@ -106,6 +108,6 @@ class SphereInplane(nn.Module):
         """Rotations (num_views * num_inplane, 3, 3), float64."""
         return sphere_inplane_rotations(self.num_views, self.num_inplane)
 
-    def extra_repr(self) -> str:
-        """Settings, for printing."""
-        return f"num_views={self.num_views}, num_inplane={self.num_inplane}"
+    def settings(self) -> dict[str, Setting]:
+        """Settings by name."""
+        return {"num_views": self.num_views, "num_inplane": self.num_inplane}

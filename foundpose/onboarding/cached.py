@@ -16,6 +16,7 @@ from foundpose.onboarding.stages import FittedWords, PatchTable, Progress, Templ
 from foundpose.onboarding.templates import TemplateCameras
 from foundpose.rendering import Mesh
 from foundpose.representation.object_representation import ObjectRepresentation
+from foundpose.utils.settings import identity
 
 Facts = dict[str, Any]
 _PROJECTION = "projection."
@@ -67,9 +68,9 @@ class CachedOnboarding:
         onboarder, extractor = self.onboarder, self.onboarder.extractor
         renderings = {
             "mesh": mesh.checksum,
-            "renderer": repr(onboarder.renderer),
+            "renderer": identity(onboarder.renderer),
             "bits": onboarder.renderer.bits,
-            "viewpoints": repr(onboarder.viewpoints),
+            "viewpoints": identity(onboarder.viewpoints),
             "image_size": onboarder.image_size,
             "fill": onboarder.fill,
             "distance": onboarder.distance,
@@ -89,7 +90,7 @@ class CachedOnboarding:
         words = {
             "descriptors": self.artefacts.key("descriptors", descriptors),
             "num_components": onboarder.projection.num_components,
-            "words": repr(onboarder.words),
+            "words": identity(onboarder.words),
         }
         return {"renderings": renderings, "patches": patches, "descriptors": descriptors, "words": words}
 
@@ -142,7 +143,7 @@ class CachedOnboarding:
         )
 
     def _descriptors(self, mesh: Mesh, report: Progress) -> tuple[list[Tensor], Tensor]:
-        """Descriptors of each batch of templates, and all global ones."""
+        """Descriptors of all templates, and their global ones."""
         onboarder = self.onboarder
         device = onboarder.device
         _, patches = self._patches(mesh, report)
@@ -171,9 +172,7 @@ class CachedOnboarding:
             return {"descriptors": descriptors, "template_cls": torch.cat(cls)}
 
         tensors = self._get("descriptors", mesh, make)
-        # The same batches as without files: sums and products round in the same way.
-        sizes = [int(batch.sum()) for batch in counts.split(onboarder.batch_size)]
-        return list(tensors["descriptors"].split(sizes)), tensors["template_cls"]
+        return [tensors["descriptors"]], tensors["template_cls"]
 
     def _words(self, mesh: Mesh, report: Progress) -> tuple[FittedWords, Tensor]:
         """Projection, words and projected descriptors; and the templates' global descriptors."""

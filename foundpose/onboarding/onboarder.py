@@ -1,7 +1,7 @@
 """From a mesh to an object representation."""
 
 import copy
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from itertools import chain
@@ -30,8 +30,11 @@ from foundpose.representation.object_representation import ObjectRepresentation,
 from foundpose.representation.quantization import Storage, check_storage
 from foundpose.retrieval import IdfMode, SoftAssignBow, VisualWords
 from foundpose.utils.batch_size import BatchSize, check_batch_size, measure_batch_size
+from foundpose.utils.settings import Setting, identity
 
 _T = TypeVar("_T")
+# Sums and products round alike, whatever batches the extractor ran in.
+_ROWS_PER_BLOCK = 4096
 
 
 class Onboarder(nn.Module):
@@ -94,6 +97,8 @@ class Onboarder(nn.Module):
             raise ValueError(f"distance must be more than one diameter, got {distance}")
         check_batch_size(batch_size)
         check_storage(storage, pq_subspaces, projection.num_components)
+        for module in (renderer, viewpoints, words, bow):
+            identity(module)  # raises for one that does not say its settings
         self.renderer = renderer
         self.extractor = extractor
         self.viewpoints = viewpoints
@@ -109,19 +114,19 @@ class Onboarder(nn.Module):
         self.storage: Storage = storage
         self.pq_subspaces = pq_subspaces
 
-    def settings(self) -> dict[str, str | int | float | bool | None]:
+    def settings(self) -> dict[str, Setting]:
         """Settings that the representation depends on, beside mesh and extractor."""
         return {
-            "viewpoints": repr(self.viewpoints),
-            "words": repr(self.words),
-            "bow": repr(self.bow),
+            "viewpoints": identity(self.viewpoints),
+            "words": identity(self.words),
+            "bow": identity(self.bow),
             "num_components": self.projection.num_components,
             "image_size": self.image_size,
             "fill": self.fill,
             "distance": self.distance,
             "mask_erosion": self.mask_erosion,
             "idf_mode": self.idf_mode,
-            "renderer": repr(self.renderer),
+            "renderer": identity(self.renderer),
             "bits": self.renderer.bits,
             "storage": self.storage,
             **({"pq_subspaces": self.pq_subspaces} if self.storage == "pq" else {}),
@@ -283,14 +288,14 @@ class Onboarder(nn.Module):
         """
         report("PCA", 0, 1)
         accumulator = CovarianceAccumulator(self.extractor.channels, self.device)
-        for batch in raw:
-            accumulator.update(batch.to(self.device))
+        for rows in _equal_blocks(raw):
+            accumulator.update(rows.to(self.device))
         projection = copy.deepcopy(self.projection).to(self.device).fit(accumulator)
         # Filled batch by batch: joining a list would take the memory twice.
         descriptors = projection.mean.new_empty(accumulator.count, projection.num_components)
         filled = 0
-        while raw:
-            projected = projection(raw.pop(0).to(self.device))
+        for rows in _equal_blocks(raw.pop(0) for _ in range(len(raw))):
+            projected = projection(rows.to(self.device))
             descriptors[filled : filled + len(projected)] = projected
             filled += len(projected)
         report("PCA", 1, 1)
@@ -354,3 +359,17 @@ class Onboarder(nn.Module):
         stored = representation.with_storage(self.storage, self.pq_subspaces)
         report("storage", 1, 1)
         return stored
+
+
+def _equal_blocks(batches: Iterable[Tensor]) -> Iterator[Tensor]:
+    """Rows (m, C) of all batches in blocks of one size, the last smaller."""
+    kept: list[Tensor] = []
+    for batch in batches:
+        kept.append(batch)
+        while sum(map(len, kept)) >= _ROWS_PER_BLOCK:
+            rows = torch.cat(kept) if len(kept) > 1 else kept[0]
+            yield rows[:_ROWS_PER_BLOCK]
+            kept = [rows[_ROWS_PER_BLOCK:]]
+    rest = torch.cat(kept) if kept else torch.empty(0, 0)
+    if len(rest) > 0:
+        yield rest

@@ -1,6 +1,5 @@
 """The composed method: from images and masks to poses."""
 
-import warnings
 from collections.abc import Sequence
 from typing import get_args
 
@@ -23,6 +22,7 @@ from foundpose.refinement import PoseProposals, PoseRefiner, RefinedPoses
 from foundpose.rendering import Mesh
 from foundpose.representation import ObjectRepresentation, RepresentationInfo
 from foundpose.retrieval import Retriever
+from foundpose.utils.warn import warn_caller
 
 
 class _ExtractorChecks:
@@ -187,8 +187,7 @@ class FoundPose(nn.Module):
         for name, value in mine.items():
             theirs = representation.info.settings.get(name, value)
             if theirs != value:
-                warnings.warn(
+                warn_caller(
                     f"{representation.info.name!r} was onboarded with {name}={theirs}, the pipeline uses {value}; "
-                    "retrieval suffers when they differ",
-                    stacklevel=4,
+                    "retrieval suffers when they differ"
                 )

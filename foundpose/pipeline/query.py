@@ -25,7 +25,7 @@ def select_query_patches(features: PatchFeatures, crops: Crops, extractor: Patch
     Differentiable w.r.t. the features.
     """
     size = crops.images.shape[-1]
-    pixels = extractor.patch_centers(size, crops.images.device, crops.images.dtype)
+    pixels = extractor.patch_centers(size, crops.masks.device, crops.masks.dtype)
     grid = (2 * pixels + 1) / size - 1
     share = F.grid_sample(
         crops.masks[:, None], grid.expand(len(crops.masks), -1, -1, -1), align_corners=False

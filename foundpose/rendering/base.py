@@ -8,10 +8,11 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
 from foundpose.rendering.mesh import Mesh
 from foundpose.rendering.shading import AMBIENT, Array64, Hits, Surface, interpolate, light
+from foundpose.utils.settings import Configured, Setting
 
 _T = TypeVar("_T")
 
@@ -93,12 +94,11 @@ class MeshCache(Generic[_T]):
         return self._entries[mesh.checksum]
 
 
-class Renderer(nn.Module, ABC):
+class Renderer(Configured, ABC):
     """Renders a mesh from a batch of cameras; subclasses decide which face each sample sees.
 
     The light is fixed to the camera: ``ambient`` from everywhere, the rest along the optical axis, on both
-    sides of a face alike. Background is black. ``repr`` must show all settings that change the pictures: it names
-    what is kept of them on disk.
+    sides of a face alike. Background is black. A subclass with settings of its own adds them to :meth:`settings`.
 
     Args:
         supersampling: n; colours are the mean of n × n regular samples per pixel. Depth, mask and normals are
@@ -164,9 +164,9 @@ class Renderer(nn.Module, ABC):
         self._render_views(mesh, surface, jobs)
         return RenderOutput(*(tensor.to(T.device) for tensor in output))
 
-    def extra_repr(self) -> str:
-        """Settings shown by ``repr``."""
-        return f"supersampling={self.supersampling}, ambient={self.ambient}"
+    def settings(self) -> dict[str, Setting]:
+        """All that changes the pictures; what is kept of them on disk is named after it."""
+        return {"supersampling": self.supersampling, "ambient": self.ambient}
 
     @abstractmethod
     def _render_views(

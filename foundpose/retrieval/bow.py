@@ -6,7 +6,9 @@ A ragged set of patches is a padded (B, P, d) tensor with a (B, P) mask; rows ou
 from typing import Literal, NamedTuple, get_args
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
+
+from foundpose.utils.settings import Configured, Setting
 
 IdfMode = Literal["document", "occurrence"]
 BowNormalization = Literal["cosine", "hellinger"]
@@ -178,7 +180,7 @@ def signed_root(x: Tensor) -> Tensor:
     return torch.where(present, root * x.sign(), torch.zeros_like(x))
 
 
-class SoftAssignBow(nn.Module):
+class SoftAssignBow(Configured):
     """Bag-of-words descriptors with soft assignment; templates and queries alike go through it.
 
     Args:
@@ -278,6 +280,6 @@ class SoftAssignBow(nn.Module):
         frequencies = tf_idf(counts, idf)
         return signed_root(frequencies) if self.normalization == "hellinger" else frequencies
 
-    def extra_repr(self) -> str:
-        """Settings, for printing."""
-        return f"sigma={self.sigma}, num_nearest={self.num_nearest}, normalization={self.normalization!r}"
+    def settings(self) -> dict[str, Setting]:
+        """Settings by name."""
+        return {"sigma": self.sigma, "num_nearest": self.num_nearest, "normalization": self.normalization}

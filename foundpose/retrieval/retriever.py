@@ -9,6 +9,7 @@ from foundpose.retrieval.base import (
     select_templates,
 )
 from foundpose.retrieval.bow import SoftAssignBow
+from foundpose.utils.settings import identity
 
 
 class TemplateRetriever(Retriever):
@@ -53,7 +54,7 @@ class TemplateRetriever(Retriever):
 
     def onboarding_settings(self) -> dict[str, str]:
         """The bag of words: its settings shape the templates' descriptors."""
-        return {"bow": repr(self.bow)}
+        return {"bow": identity(self.bow)}
 
 
 class ClsRetriever(Retriever):

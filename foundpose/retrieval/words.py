@@ -1,11 +1,12 @@
 """Visual words: the clusters of an object's patch descriptors."""
 
-from torch import Tensor, nn
+from torch import Tensor
 
 from foundpose.clustering.kmeans import Progress, kmeans
+from foundpose.utils.settings import Configured, Setting
 
 
-class VisualWords(nn.Module):
+class VisualWords(Configured):
     """Clusters descriptors to visual words; see :func:`foundpose.clustering.kmeans.kmeans`.
 
     Args:
@@ -46,9 +47,11 @@ class VisualWords(nn.Module):
             descriptors, self.num_words, self.num_iterations, self.seed, self.tolerance, progress
         ).centroids
 
-    def extra_repr(self) -> str:
-        """Settings, for printing."""
-        return (
-            f"num_words={self.num_words}, num_iterations={self.num_iterations}, "
-            f"tolerance={self.tolerance}, seed={self.seed}"
-        )
+    def settings(self) -> dict[str, Setting]:
+        """Settings by name."""
+        return {
+            "num_words": self.num_words,
+            "num_iterations": self.num_iterations,
+            "tolerance": self.tolerance,
+            "seed": self.seed,
+        }

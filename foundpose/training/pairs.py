@@ -19,6 +19,7 @@ from foundpose.rendering import Mesh
 from foundpose.synthetic import LightVariation, combine_seeds
 from foundpose.training.views import nearby_rotations, render_crops, render_templates
 from foundpose.utils.files import write_atomically
+from foundpose.utils.settings import identity
 
 
 class PairBatch(NamedTuple):
@@ -172,12 +173,13 @@ def make_pairs(
     path = None
     if cache is not None:
         facts = {
-            "format": 1,
+            "format": 2,
             "meshes": [mesh.checksum for mesh in meshes],
             "extractor": onboarder.extractor.fingerprint(),
             "templates": [onboarder.image_size, onboarder.fill, onboarder.distance, onboarder.mask_erosion],
-            "renderer": repr(onboarder.renderer),
-            "crop": [crop.size, crop.fill, crop.antialias, crop.min_box_size],
+            "precision": onboarder.extractor.running_precision(),
+            "renderer": identity(onboarder.renderer),
+            "crop": crop.settings(),
             "pairs": asdict(settings),
             "seed": seed,
         }
