@@ -121,10 +121,9 @@ def main(cfg: DictConfig) -> None:
     """Measure, write ``scaling.json``, ``scaling.md`` and ``scaling.png``, and print the table."""
     folder = Path(HydraConfig.get().runtime.output_dir)
     with clear_errors():
-        cfg = prepared(cfg)
         rows = measure(cfg, folder / "objects" if cfg.files is None else Path(cfg.files))
         content = {
-            "settings": OmegaConf.to_container(cfg, resolve=True),
+            "settings": OmegaConf.to_container(prepared(cfg), resolve=True),
             "hardware": describe_hardware(torch.device("cpu")),
             "versions": describe_versions(),
             "rows": [asdict(row) for row in rows],
@@ -156,6 +155,7 @@ def measure(cfg: DictConfig, files: Path) -> list[Row]:
         raise ValueError(f"counts and crops must be at least 1, got {list(cfg.counts)} and {cfg.crops}")
     if not _STATUS.is_file():
         raise ValueError(f"resident memory is read from {_STATUS}, which this system does not have")
+    cfg = prepared(cfg)
     workload = make_workload(_sizes(cfg))
     crops = Crops(cfg, workload)
     crops.seconds(0, workload.representation)  # whatever is done once

@@ -1,4 +1,6 @@
 import inspect
+import subprocess
+import sys
 from importlib import import_module
 from pathlib import Path
 
@@ -226,3 +228,25 @@ def test_evaluation_takes_what_its_config_says():
         parameters = dict(inspect.signature(get_class(node._target_).__init__).parameters)
         assert set(parameters) - {"self"} == runtime | {k for k in node if not k.startswith("_")}
         assert all(parameters[k].default == node[k] for k in node if not k.startswith("_"))
+
+
+def run_app(code):
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+
+
+def test_bad_input_is_one_line_that_says_how_to_see_more():
+    refused = "from foundpose import PerspectiveCrop; PerspectiveCrop(0)"
+    code = f"from foundpose.config import clear_errors\nwith clear_errors():\n    {refused}"
+    done = run_app(code)
+    assert done.returncode == 2
+    (line,) = done.stderr.strip().splitlines()
+    assert line == "error: size must be at least 2 pixels, got 0 (HYDRA_FULL_ERROR=1 shows where)"
+
+
+def test_a_mistake_in_a_program_keeps_its_traceback():
+    code = (
+        "import numpy\nfrom foundpose.config import clear_errors\nwith clear_errors():\n    numpy.stack([])"
+    )
+    done = run_app(code)
+    assert done.returncode == 1
+    assert "Traceback" in done.stderr

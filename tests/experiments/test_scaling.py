@@ -30,6 +30,16 @@ def config(*overrides: str):
         return compose("scaling", overrides=[*SMALL, *overrides])
 
 
+def test_pq_alone_has_the_bytes_of_the_configuration(app, tmp_path) -> None:
+    cfg = config("counts=[2]", "storages=[pq,pq8]", "crops=2", "onboarder.pq_subspaces=16")
+    before = cfg.copy()
+    plain, eight = app["measure"](cfg, tmp_path)
+    assert cfg == before
+    # 20 templates of at most 60 patches, and 16 in place of 8 bytes for each; the codebooks are as large.
+    assert 0.9 < (plain.disk - eight.disk) / (2 * 20 * 60 * 8) <= 1.0
+    assert app["parse_storage"]("pq8", 16) == ("pq", 8)
+
+
 def test_rows_are_measured_as_far_as_the_disk_allows(app, tmp_path) -> None:
     cfg = config("counts=[3,2,2000]", "storages=[float32,pq8]", "crops=4", "disk_limit=0.01")
     rows = app["measure"](cfg, tmp_path / "objects")

@@ -289,3 +289,21 @@ def test_a_killed_job_loses_only_the_stage_that_it_was_at(blob, tmp_path, monkey
     assert work.done == {"descriptors": 10, "PCA": 1, "words": 1}
     assert_same(representation, small_onboarder()(blob, "blob"))
     assert not list(tmp_path.glob("*/*/.*-*.safetensors"))
+
+
+def test_what_is_there_needs_no_batch_size(blob, tmp_path):
+    artefacts = ArtefactStore(tmp_path)
+    first = CachedOnboarding(small_onboarder(batch_size=3), artefacts)(blob, "blob")
+
+    def measured(*_):
+        raise AssertionError("the network was run to find a batch size")
+
+    again = small_onboarder(words=VisualWords(24), batch_size="auto")
+    again._try_batch = measured
+    other = CachedOnboarding(again, artefacts)(blob, "blob")
+    assert other.words.shape[0] == 24
+    # Nor does it matter for what is computed of it.
+    assert torch.equal(first.descriptors, other.descriptors)
+    assert_same(
+        first, CachedOnboarding(small_onboarder(batch_size=7), ArtefactStore(tmp_path / "b"))(blob, "blob")
+    )

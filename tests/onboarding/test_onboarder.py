@@ -141,3 +141,18 @@ def test_store_onboards_once_and_separates_settings(blob, tmp_path):
     assert not other.has(blob, "blob")
     assert other.path(blob, "blob") != store.path(blob, "blob")
     assert isinstance(ObjectRepresentation.load(store.path(blob, "blob")), ObjectRepresentation)
+
+
+class TwoSides(torch.nn.Module):
+    """Viewpoints of somebody's own, which do not say their settings."""
+
+    def forward(self):
+        return torch.eye(3, dtype=torch.float64).repeat(2, 1, 1)
+
+
+def test_viewpoints_must_say_their_settings():
+    with pytest.raises(ValueError, match=r"TwoSides has no method settings\(\), so files made with it"):
+        make_onboarder(viewpoints=TwoSides())
+    viewpoints = TwoSides()
+    viewpoints.settings = lambda: {"sides": 2}
+    assert make_onboarder(viewpoints=viewpoints).settings()["viewpoints"] == "TwoSides(sides=2)"

@@ -14,7 +14,7 @@ from foundpose import (
     TemplateStart,
 )
 from foundpose.evaluation.records import pose_records
-from foundpose.features import CoordinateCode, DinoV2, PatchNoise, PcaProjection
+from foundpose.features import CoordinateCode, DenseSift, DinoV2, PatchNoise, PcaProjection
 from foundpose.geometry import (
     PerspectiveCrop,
     SuperFibonacci,
@@ -558,3 +558,29 @@ def test_starts_and_verification_choose_among_more_hypotheses(blob, oracle_blob)
     # The scorer compares refined poses, too.
     assert torch.equal(refined.score, refined.refined.score.amax(1))
     torch.testing.assert_close(one.T_camera_from_model, e.T_camera_from_model[1:2], atol=1e-2, rtol=1e-4)
+
+
+def test_pictures_in_half_precision(scene, blob):
+    _, masks, T = scene
+    extractor, bow = DenseSift(), SoftAssignBow(0.3)
+    onboard = Onboarder(RaycastRenderer(), extractor, SuperFibonacci(20), VisualWords(16), bow)
+    representation = onboard(blob, "blob")
+    image = RaycastRenderer()(blob, T, K.expand(2, 3, 3), SIZE).rgb.amax(dim=0)
+    pipeline = make_pipeline(extractor, retriever=TemplateRetriever(bow))
+    full = estimate_scene(pipeline, (image, masks, T), representation)
+    for dtype in (torch.float16, torch.bfloat16):
+        e = estimate_scene(pipeline, (image.to(dtype), masks, T), representation)
+        assert e.T_camera_from_model.dtype == e.query.pixels.dtype == torch.float32
+        assert torch.equal(e.query.pixels, full.query.pixels)
+        assert torch.equal(e.templates.index[:, 0], full.templates.index[:, 0])
+        same = (e.correspondences.points_model == full.correspondences.points_model).all(dim=-1)
+        assert same[:, 0].float().mean() > 0.7
+
+
+def test_the_warning_of_other_settings_names_this_file(scene, oracle_blob):
+    pipeline = make_pipeline(retriever=TemplateRetriever(SoftAssignBow(sigma=3.0)))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        estimate_scene(pipeline, scene, oracle_blob)
+    (warning,) = [w for w in caught if "was onboarded with bow=" in str(w.message)]
+    assert warning.filename == __file__

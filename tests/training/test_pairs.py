@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from foundpose.features import AdaptedExtractor
 from foundpose.geometry import (
+    PerspectiveCrop,
     SuperFibonacci,
     no_symmetries,
     project_points,
@@ -134,7 +135,7 @@ def test_pairs_follow_the_seed_alone(pairs, bodies, sift_onboarder, crop, settin
     assert not torch.allclose(other.T_crop_from_model, pairs[0].T_crop_from_model, atol=0.1)
 
 
-def test_cache(bodies, sift_onboarder, crop, settings, tmp_path):
+def test_cache(bodies, sift_onboarder, crop, settings, tmp_path, monkeypatch):
     few = dataclasses.replace(settings, crops_per_mesh=2)
     steps = []
 
@@ -156,7 +157,12 @@ def test_cache(bodies, sift_onboarder, crop, settings, tmp_path):
     other.extractor = AdaptedExtractor(sift_onboarder.extractor)
     make(other)
     assert steps == [2]
-    assert len(list(tmp_path.iterdir())) == 3
+    black = PerspectiveCrop(crop.size, crop.fill, background="black")
+    make_pairs(bodies[:1], sift_onboarder, black, few, 0, tmp_path)
+    monkeypatch.setattr(type(sift_onboarder.extractor), "running_precision", lambda _: "bf16")
+    make()
+    assert steps == [2]
+    assert len(list(tmp_path.iterdir())) == 5
 
 
 def test_symmetries_go_with_their_objects(bodies, sift_onboarder, crop, settings, tmp_path):
