@@ -7,9 +7,9 @@ import torch
 from torch import Tensor, nn
 
 from foundpose.geometry import project_points, transform_points
-from foundpose.representation import ObjectRepresentation
+from foundpose.representation import ObjectRepresentation, RepresentationInfo
 from foundpose.retrieval import QueryPatches
-from foundpose.retrieval.base import normalize_rows
+from foundpose.retrieval.base import normalize_rows, spread_patches
 
 # A patch of the crop sees the object where a patch of the template lands within so many cells of it.
 _SEEN_WITHIN = 1.0
@@ -90,17 +90,21 @@ class PatchVerification(HypothesisScorer):
     Args:
         similarity: weight of the similarity; inliers weigh 1.
         coverage: weight of the coverage.
+        max_patches: the similarity is that of at most this many patches of a crop, evenly spread; None: of all.
 
     Raises:
-        ValueError: a negative weight.
+        ValueError: a setting out of range.
     """
 
-    def __init__(self, similarity: float = 0.5, coverage: float = 1.0) -> None:
+    def __init__(self, similarity: float = 0.5, coverage: float = 1.0, max_patches: int | None = 128) -> None:
         super().__init__()
+        if max_patches is not None and max_patches < 1:
+            raise ValueError(f"max_patches must be at least 1 or None, got {max_patches}")
         if not (similarity >= 0 and coverage >= 0):
             raise ValueError(f"similarity and coverage must not be negative, got {similarity} and {coverage}")
         self.similarity = similarity
         self.coverage = coverage
+        self.max_patches = max_patches
 
     def forward(
         self,
@@ -112,17 +116,21 @@ class PatchVerification(HypothesisScorer):
     ) -> Tensor:
         """Score poses; see the class."""
         with torch.no_grad():
-            found = pose_agreement(T_crop_from_model, query, K_crop, representation)
+            found = pose_agreement(T_crop_from_model, query, K_crop, representation, self.max_patches)
             total = inlier_share + self.similarity * found.similarity.clamp(min=0.0)
             return (total + self.coverage * found.coverage) / (1.0 + self.similarity + self.coverage)
 
     def extra_repr(self) -> str:
         """Settings, for printing."""
-        return f"similarity={self.similarity}, coverage={self.coverage}"
+        return f"similarity={self.similarity}, coverage={self.coverage}, max_patches={self.max_patches}"
 
 
 def pose_agreement(
-    T_crop_from_model: Tensor, query: QueryPatches, K_crop: Tensor, representation: ObjectRepresentation
+    T_crop_from_model: Tensor,
+    query: QueryPatches,
+    K_crop: Tensor,
+    representation: ObjectRepresentation,
+    max_patches: int | None = None,
 ) -> Agreement:
     """Compare crops (B) with what n poses (B, n, 4, 4) of each say that they show; see :class:`PatchVerification`.
 
@@ -130,7 +138,7 @@ def pose_agreement(
     """
     n, info = T_crop_from_model.shape[1], representation.info
     views = representation.nearest_views(T_crop_from_model).squeeze(-1)
-    patches = representation.gather_templates(views)
+    patches = representation.gather_templates(views, components=1)  # their places; few descriptors are needed
     points = transform_points(T_crop_from_model, patches.points_model.to(T_crop_from_model))
     pixels, depth = project_points(points, K_crop.unsqueeze(1))
     landed = (pixels - info.offset) / info.stride  # (B, n, Q, 2) cells
@@ -138,20 +146,20 @@ def pose_agreement(
     # Far outside, where nothing is.
     landed = torch.where(usable.unsqueeze(-1), landed, landed.new_tensor(-1e4))
 
-    at_query = ((query.pixels - info.offset) / info.stride).to(landed)
+    inside = _mark(_cells(query, info).round().long(), query.valid, info.grid)
+    query = spread_patches(query, max_patches)
+    at_query = _cells(query, info).to(landed)
     distance = torch.cdist(at_query.unsqueeze(1).expand(-1, n, -1, -1), landed)
     nearest = distance.min(dim=3)
     seen = (nearest.values < _SEEN_WITHIN) & query.valid.unsqueeze(1)
-    lies_there = patches.descriptors.gather(
-        2, nearest.indices.unsqueeze(-1).expand(-1, -1, -1, patches.descriptors.shape[-1])
-    )
+    row = representation.template_offsets[views].unsqueeze(-1) + nearest.indices
+    lies_there = representation.read_descriptors(row.clamp(max=len(representation.points_model) - 1))
     cosine = (normalize_rows(lies_there) * normalize_rows(query.descriptors.to(lies_there)).unsqueeze(1)).sum(
         -1
     )
     count = query.valid.sum(dim=1, keepdim=True).clamp(min=1)
     similarity = torch.where(seen, cosine, torch.zeros_like(cosine)).sum(dim=2) / count
 
-    inside = _mark(at_query.round().long(), query.valid, info.grid)
     # A patch covers a square of its own size: too much, and the pose seems better the smaller the object is in the
     # crop.
     views_scale = _scale(
@@ -162,6 +170,11 @@ def pose_agreement(
     both = (covered & inside.unsqueeze(1)).sum(dim=2)
     either = (covered | inside.unsqueeze(1)).sum(dim=2)
     return Agreement(similarity, both / either.clamp(min=1))
+
+
+def _cells(query: QueryPatches, info: RepresentationInfo) -> Tensor:
+    """Places (B, P, 2) of a crop's patches in the grid, as (column, row)."""
+    return (query.pixels - info.offset) / info.stride
 
 
 def _mark(cells: Tensor, which: Tensor, grid: int) -> Tensor:

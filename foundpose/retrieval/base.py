@@ -85,6 +85,23 @@ def normalize_rows(x: Tensor) -> Tensor:
     return x / norm.where(norm > 0, torch.inf)
 
 
+def spread_patches(query: QueryPatches, most: int | None) -> QueryPatches:
+    """At most so many of each crop's valid patches, in an order whose every beginning is evenly spread."""
+    available = query.valid.shape[1]
+    most = available if most is None else min(most, available)
+    place = torch.arange(most, device=query.valid.device)
+    # Multiples of the golden ratio's inverse leave no gaps, however many are taken.
+    place = (place * 0.6180339887498949).remainder(1.0).argsort()
+    count = query.valid.sum(dim=1, keepdim=True)
+    number = count.clamp(max=most)
+    chosen = ((place * count) // number.clamp(min=1)).clamp(max=available - 1)
+    return query._replace(
+        descriptors=torch.take_along_dim(query.descriptors, chosen.unsqueeze(-1), dim=1),
+        pixels=torch.take_along_dim(query.pixels, chosen.unsqueeze(-1), dim=1),
+        valid=place < number,
+    )
+
+
 def select_templates(similarity: Tensor, valid: Tensor, num_templates: int) -> RetrievedTemplates:
     """Keep the most similar templates; of equal ones, those with lower indices.
 

@@ -12,6 +12,7 @@ from foundpose.retrieval.base import (
     RetrievedTemplates,
     Retriever,
     normalize_rows,
+    spread_patches,
 )
 
 Alignment = Literal["none"] | InPlane
@@ -107,7 +108,7 @@ class SpatialReranker(Retriever):
         self, query: QueryPatches, index: ObjectRepresentation, candidates: RetrievedTemplates
     ) -> Tensor:
         """Scores (B, h) of candidates; −inf where not valid. Differentiable as :meth:`forward`."""
-        query = _spread(query, self.max_patches)
+        query = spread_patches(query, self.max_patches)
         per_crop = candidates.index.shape[1] * max(index.max_patches, 1) * max(query.valid.shape[1], 1)
         step = max(1, _SIMILARITIES_PER_BLOCK // per_crop)
         blocks = [slice(first, first + step) for first in range(0, len(query.valid), step)]
@@ -169,23 +170,6 @@ class SpatialReranker(Retriever):
             f"num_templates={self.num_templates}, position_weight={self.position_weight}, "
             f"alignment={self.alignment!r}, max_patches={self.max_patches}, components={self.components}"
         )
-
-
-def _spread(query: QueryPatches, most: int | None) -> QueryPatches:
-    """At most so many of each crop's valid patches, in an order whose every beginning is evenly spread."""
-    available = query.valid.shape[1]
-    most = available if most is None else min(most, available)
-    place = torch.arange(most, device=query.valid.device)
-    # Multiples of the golden ratio's inverse leave no gaps, however many are taken.
-    place = (place * 0.6180339887498949).remainder(1.0).argsort()
-    count = query.valid.sum(dim=1, keepdim=True)
-    number = count.clamp(max=most)
-    chosen = ((place * count) // number.clamp(min=1)).clamp(max=available - 1)
-    return query._replace(
-        descriptors=torch.take_along_dim(query.descriptors, chosen.unsqueeze(-1), dim=1),
-        pixels=torch.take_along_dim(query.pixels, chosen.unsqueeze(-1), dim=1),
-        valid=place < number,
-    )
 
 
 def _squared_distances(A: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
