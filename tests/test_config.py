@@ -160,6 +160,7 @@ DELIBERATE = {
     ("pnp", "p3p_ransac"): {"guidance"},
     ("pnp", "soft_ransac"): {"guidance"},
     ("pnp", "epnp_ransac"): {"solver", "mirror"},
+    ("pnp", "dlt_ransac"): {"solver", "guidance"},
     ("robust_loss", "huber"): {"scale"},
     ("robust_loss", "barron"): {"scale"},
     ("crop", "perspective"): {"background"},

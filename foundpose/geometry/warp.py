@@ -1,7 +1,7 @@
 """Perspective warps of images to square crops, with an image pyramid where they shrink.
 
-kornia's ``remap`` samples; the positions are found once for a picture, the levels of its pyramid and its mask, which
-takes half of the time of kornia's ``warp_perspective`` (docs/kornia.md; the tests compare them).
+kornia's ``remap`` samples, at positions that are found once for a picture, the levels of its pyramid and its mask.
+The tests compare it with kornia's ``warp_perspective``.
 """
 
 import math
@@ -38,7 +38,8 @@ def sample_pixels(images: Tensor, positions: Tensor) -> Tensor:
 
     Differentiable w.r.t. both arguments.
     """
-    return remap(images, *positions.unbind(1), align_corners=True)
+    u, v = positions.unbind(1)
+    return remap(images, u, v, align_corners=True)
 
 
 def warp_images(

@@ -10,7 +10,7 @@ from foundpose.geometry.cameras import pixel_rays
 from foundpose.geometry.transforms import make_transform
 from foundpose.pnp.gauss_newton import GaussNewtonPnp
 from foundpose.pnp.polish import check_correspondences, invertible_intrinsics, usable_coordinates
-from foundpose.pnp.sampling import SAMPLE_SIZE, Hypotheses, SolverName, check_solver, sample_hypotheses
+from foundpose.pnp.sampling import Hypotheses, SolverName, sample_hypotheses, sample_size
 from foundpose.pnp.scoring import reprojection_errors, select_inliers
 from foundpose.pnp.soft_selection import PoseCandidates, SoftInlierSelection
 from foundpose.pnp.weak_perspective import mirrored_poses
@@ -22,6 +22,9 @@ _MIRROR_STEPS = 4
 # A rough start's inliers are those within so many thresholds, and it is given so many steps on them, in turn.
 _WIDE = (2.8, 1.4)
 _WIDE_STEPS = 4
+
+# Below so many inliers there is nothing to polish on.
+_LEAST_POLISHED = 4
 
 
 class PnpStatus(IntEnum):
@@ -74,11 +77,11 @@ class RansacPnp(nn.Module):
     decisions are made per problem: neighbours, padding, batch size and device do not change a result.
 
     Args:
-        solver: minimal solver on samples of four: "p3p" on three of them with the fourth to choose the root, or
-            "epnp" (the paper's).
+        solver: minimal solver: "p3p" on three of four correspondences with the fourth to choose the root, "epnp" on
+            four (the paper's), or "dlt" on six, kornia's direct linear transform, which flat objects defeat.
         iterations: samples drawn for each problem.
         threshold: largest distance of an inlier's projection from its pixel, in pixels.
-        min_inliers: poses with fewer inliers are flagged. (Four points always fit themselves.)
+        min_inliers: poses with fewer inliers are flagged. (A sample always fits itself.)
         confidence: stop a problem's sampling once an all-inlier sample has been drawn with this probability,
             judged by the best inlier ratio so far; None draws all samples.
         polish_rounds: how often the inliers are selected anew and the pose polished on them.
@@ -120,22 +123,23 @@ class RansacPnp(nn.Module):
         guidance: float = 1.0,
     ) -> None:
         super().__init__()
-        check_solver(solver)
+        size = sample_size(solver)
         if not guidance >= 1:
             raise ValueError(f"guidance must be at least 1, got {guidance}")
         if iterations < 1 or (chunk is not None and chunk < 1):
             raise ValueError(f"iterations and chunk must be at least 1, got {iterations} and {chunk}")
-        if score_points is not None and score_points < SAMPLE_SIZE:
-            raise ValueError(f"score_points must be at least {SAMPLE_SIZE} or None, got {score_points}")
+        if score_points is not None and score_points < size:
+            raise ValueError(f"score_points must be at least {size} or None, got {score_points}")
         if not threshold > 0:
             raise ValueError(f"threshold must be positive (pixels), got {threshold}")
-        if min_inliers < SAMPLE_SIZE:
-            raise ValueError(f"min_inliers must be at least {SAMPLE_SIZE}, got {min_inliers}")
+        if min_inliers < size:
+            raise ValueError(f"min_inliers must be at least {size}, got {min_inliers}")
         if confidence is not None and not 0 < confidence < 1:
             raise ValueError(f"confidence must lie between 0 and 1, got {confidence}")
         if polish_rounds < 0:
             raise ValueError(f"polish_rounds must be at least 0, got {polish_rounds}")
         self.solver: SolverName = solver
+        self.sample_size = size
         self.threshold = threshold
         self.min_inliers = min_inliers
         self.confidence = confidence
@@ -148,7 +152,7 @@ class RansacPnp(nn.Module):
         self.guidance = guidance
         generator = torch.Generator().manual_seed(seed)
         # Integers, so that every device turns them into the same indices.
-        draws = torch.randint(2**31, (iterations, SAMPLE_SIZE), generator=generator)
+        draws = torch.randint(2**31, (iterations, size), generator=generator)
         self.register_buffer("draws", draws, persistent=False)
         # Of ranks by priority: the smaller, the better.
         guided = ((draws.double() / 2**31) ** guidance * 2**31).long()
@@ -209,7 +213,7 @@ class RansacPnp(nn.Module):
         K, valid, problem = self._problem(points_image, points_model, K, valid, weights)
         points_image, points_model, weights = problem.points_image, problem.points_model, problem.weights
         count = valid.sum(-1)
-        usable = (count >= SAMPLE_SIZE) & invertible
+        usable = (count >= self.sample_size) & invertible
         hypotheses = self._sample(points_image, points_model, K, valid, usable, priority)
         kept = hypotheses.T.shape[1]
         found = hypotheses.quality.flatten() >= 0
@@ -277,7 +281,7 @@ class RansacPnp(nn.Module):
         status = status.masked_fill(num_inliers < self.min_inliers, int(PnpStatus.TOO_FEW_INLIERS))
         status = status.masked_fill(~found, int(PnpStatus.BEHIND_CAMERA))
         status = status.masked_fill(~determined, int(PnpStatus.DEGENERATE))
-        status = status.masked_fill(count < SAMPLE_SIZE, int(PnpStatus.TOO_FEW_CORRESPONDENCES))
+        status = status.masked_fill(count < self.sample_size, int(PnpStatus.TOO_FEW_CORRESPONDENCES))
         squared, _ = reprojection_errors(T, *problem[:3])
         mean = torch.where(inliers, squared, torch.zeros_like(squared)).sum(-1) / num_inliers.clamp(min=1)
         # The clamp keeps the square root's derivative finite for data that fit exactly.
@@ -326,11 +330,11 @@ class RansacPnp(nn.Module):
                     inliers, _ = select_inliers(
                         T, *problem[:4], factor * self.threshold, problem.weights, self.polish.loss
                     )
-                    enough = inliers.sum(-1) >= SAMPLE_SIZE
+                    enough = inliers.sum(-1) >= _LEAST_POLISHED
                     rough = self.polish.optimise(T, *problem[:3], problem.weigh(inliers), _ROUGH, _WIDE_STEPS)
                     T = torch.where(enough[:, None, None], rough[0].T, T)
             count = valid.sum(-1)
-            found = sane & invertible & (count >= SAMPLE_SIZE)
+            found = sane & invertible & (count >= self.sample_size)
             T, inliers, regular = self._polish(T, found, problem, mirror=False)
             return self._result(T, inliers, regular, found, torch.ones_like(found), count, problem, None)
 
@@ -425,8 +429,7 @@ class RansacPnp(nn.Module):
         inliers, _, cost = self._select(T, problem)
         # Equal but for rounding counts as equal, or rounding would decide whether the last polish is kept.
         most = before.cost * (1.0 + 64.0 * torch.finfo(cost.dtype).eps)
-        # Below four inliers there is nothing to polish on.
-        enough = torch.minimum(inliers.sum(-1), before.inliers.sum(-1)) >= SAMPLE_SIZE
+        enough = torch.minimum(inliers.sum(-1), before.inliers.sum(-1)) >= _LEAST_POLISHED
         better = active & enough & (cost <= most)
         return _where(better, _Polished(T, inliers, before.inliers, cost), before), better
 

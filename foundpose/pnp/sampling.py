@@ -9,15 +9,17 @@ from torch import Tensor
 
 from foundpose.geometry.cameras import pixel_rays
 from foundpose.geometry.transforms import transform_points
+from foundpose.pnp.dlt import solve_dlt_minimal
 from foundpose.pnp.epnp import MinimalSolution, solve_epnp_minimal
 from foundpose.pnp.p3p import solve_p3p_rays
 from foundpose.pnp.scoring import score_poses
 
-SAMPLE_SIZE = 4
+# Correspondences of a sample.
+_SAMPLE_SIZES = {"epnp": 4, "p3p": 4, "dlt": 6}
 # A sample of inliers only may still be a poor one, through their noise: this many are drawn whatever the confidence.
 _LEAST_SAMPLES = 50
 
-SolverName = Literal["epnp", "p3p"]
+SolverName = Literal["epnp", "p3p", "dlt"]
 
 
 class Hypotheses(NamedTuple):
@@ -57,17 +59,23 @@ def solve_p3p_minimal(rays: Tensor, points_model: Tensor) -> MinimalSolution:
     return MinimalSolution(T, ahead.any(1), roots.degenerate)
 
 
-# Rays (S, 4, 3) and model points (S, 4, 3) to poses.
+# Rays (S, n, 3) and model points (S, n, 3) to poses.
 _SOLVERS: dict[str, Callable[[Tensor, Tensor], MinimalSolution]] = {
     "epnp": solve_epnp_minimal,
     "p3p": solve_p3p_minimal,
+    "dlt": solve_dlt_minimal,
 }
 
 
-def check_solver(solver: str) -> None:
-    """Raise ValueError for an unknown minimal solver."""
+def sample_size(solver: str) -> int:
+    """How many correspondences a minimal solver takes.
+
+    Raises:
+        ValueError: an unknown solver.
+    """
     if solver not in _SOLVERS:
         raise ValueError(f"solver must be one of {sorted(_SOLVERS)}, got {solver!r}")
+    return _SAMPLE_SIZES[solver]
 
 
 def sample_hypotheses(
@@ -93,8 +101,8 @@ def sample_hypotheses(
         points_model: (B, N, 3), finite.
         K: (B, 3, 3), invertible.
         valid: (B, N) bool.
-        usable: (B,) bool, problems to look at; they have at least four valid correspondences.
-        draws: (I, 4) integers in [0, 2³¹), the same for all problems; small ones stand for high priorities.
+        usable: (B,) bool, problems to look at; they have at least as many valid correspondences as a sample.
+        draws: (I, n) integers in [0, 2³¹), the same for all problems; small ones stand for high priorities.
         priority: (B, N); None: that of the order given.
         solver: minimal solver.
         threshold: of an inlier, pixels.
@@ -111,7 +119,7 @@ def sample_hypotheses(
     best_T = torch.eye(4, dtype=K.dtype, device=K.device).repeat(batch, keep, 1, 1)
     best_quality = K.new_full((batch, keep), -1.0)
     determined = torch.zeros_like(usable)
-    if batch == 0 or points < SAMPLE_SIZE:
+    if batch == 0 or points < draws.shape[1]:
         return Hypotheses(best_T, best_quality, determined)
     # Valid correspondences first, so that a rank among the valid ones becomes an index.
     order = torch.argsort((~valid).to(torch.uint8), dim=-1, stable=True)
@@ -143,7 +151,7 @@ def sample_hypotheses(
         quality = samples.quality.masked_fill(~active.unsqueeze(1), -1.0)
         enough = None
         if confidence is not None:
-            enough = _has_enough(before[:, :1], quality, first, mine.num_scored, confidence)
+            enough = _has_enough(before[:, :1], quality, first, mine.num_scored, confidence, draws.shape[1])
             # A sample counts if those before it were not enough.
             quality[:, 1:].masked_fill_(enough[:, :-1], -1.0)
         known = (~samples.degenerate).any(1) & active
@@ -235,11 +243,12 @@ def _scored_points(
 
 def _solve_and_score(data: _Correspondences, draws: Tensor, solver: SolverName, threshold: float) -> _Samples:
     """Poses of samples and their qualities."""
-    ranks = distinct_ranks(draws, data.num_valid.clamp(min=SAMPLE_SIZE))
+    size = draws.shape[1]
+    ranks = distinct_ranks(draws, data.num_valid.clamp(min=size))
     index = torch.take_along_dim(data.order, ranks.flatten(1), dim=1).unsqueeze(-1)
     solution = _SOLVERS[solver](
-        torch.take_along_dim(data.rays, index, dim=1).reshape(-1, SAMPLE_SIZE, 3),
-        torch.take_along_dim(data.points_model, index, dim=1).reshape(-1, SAMPLE_SIZE, 3),
+        torch.take_along_dim(data.rays, index, dim=1).reshape(-1, size, 3),
+        torch.take_along_dim(data.points_model, index, dim=1).reshape(-1, size, 3),
     )
     samples = ranks.shape[:2]
     T = solution.T_camera_from_model.unflatten(0, samples)
@@ -251,7 +260,9 @@ def _solve_and_score(data: _Correspondences, draws: Tensor, solver: SolverName, 
     )
 
 
-def _has_enough(before: Tensor, quality: Tensor, first: int, num_scored: Tensor, confidence: float) -> Tensor:
+def _has_enough(
+    before: Tensor, quality: Tensor, first: int, num_scored: Tensor, confidence: float, size: int
+) -> Tensor:
     """Whether, after each of further samples (P, I), one with inliers only has been drawn with that probability.
 
     Args:
@@ -260,11 +271,12 @@ def _has_enough(before: Tensor, quality: Tensor, first: int, num_scored: Tensor,
         first: number of samples before these.
         num_scored: (P,) number of correspondences that the qualities count.
         confidence: the probability.
+        size: correspondences of a sample.
     """
     best = torch.maximum(quality.cummax(dim=1).values, before)
     ratio = best.clamp(min=0.0).floor() / num_scored.clamp(min=1).unsqueeze(1)
     drawn = torch.arange(first + 1, first + 1 + quality.shape[1], device=quality.device)
-    missed = drawn * torch.log1p(-ratio.clamp(max=1.0 - 1e-6).pow(SAMPLE_SIZE))
+    missed = drawn * torch.log1p(-ratio.clamp(max=1.0 - 1e-6).pow(size))
     return (missed <= math.log(1.0 - confidence)) & (drawn >= _LEAST_SAMPLES)
 
 

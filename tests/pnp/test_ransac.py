@@ -340,7 +340,7 @@ def test_state_and_empty_input() -> None:
         ({"min_inliers": 3}, "min_inliers must be at least 4, got 3"),
         ({"confidence": 1.0}, "confidence must lie between 0 and 1, got 1.0"),
         ({"polish_rounds": -1}, "polish_rounds must be at least 0, got -1"),
-        ({"solver": "dlt"}, r"solver must be one of \['epnp', 'p3p'\], got 'dlt'"),
+        ({"solver": "upnp"}, r"solver must be one of \['dlt', 'epnp', 'p3p'\], got 'upnp'"),
     ],
 )
 def test_bad_settings(arguments: dict, message: str) -> None:
