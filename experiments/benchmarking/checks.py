@@ -3,7 +3,15 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from benchmarking.inference import COARSE, HOOKED, REFINE_ONE, YARDSTICK, refine_all_name
+from benchmarking.inference import (
+    CANDIDATES,
+    COARSE,
+    HOOKED,
+    REFINE_ONE,
+    RETRIEVAL,
+    YARDSTICK,
+    refine_all_name,
+)
 from benchmarking.onboarding import BAGS, KMEANS, PCA, RENDERING, WHOLE
 from benchmarking.references import Comparison
 from benchmarking.tasks import Row
@@ -74,12 +82,19 @@ def _inference_checks(rows: Sequence[Row], hypotheses: int, device: str) -> list
         if 1 in refine:
             name = "refinement of 1 hypothesis, batch 1, share of the yardstick"
             checks.append(Check(name, 100 * refine[1] / yardstick[1], 10.0, "%"))
+    large = max(coarse, default=0)
+    if device == "cpu" and large > 1 and large in yardstick:
+        name = f"all coarse stages but the extractor, batch {large}, share of the yardstick"
+        checks.append(Check(name, 100 * coarse[large] / yardstick[large], 12.0, "%"))
+    candidates, retrieval = shares(rows, CANDIDATES), shares(rows, RETRIEVAL)
+    for size in candidates.keys() & retrieval.keys():
+        name = f"re-ranking, batch {size}, per crop"
+        checks.append(Check(name, 1e3 * (retrieval[size] - candidates[size]), 5.0, "ms"))
     for label, found in (("coarse stages", coarse), ("refinement of 1 hypothesis", refine)):
         largest = max(found, default=1)
         if 1 in found and largest > 1:
             name = f"{label}, per crop at batch {largest} beside batch 1"
             checks.append(Check(name, 100 * found[largest] / found[1], 100.0, "%"))
-    large = max(coarse, default=0)
     if device == "cuda" and large >= _GPU_BATCH and large in extractor:
         name = f"all coarse stages but the extractor, batch {large}, share of the extractor"
         checks.append(Check(name, 100 * coarse[large] / extractor[large], 25.0, "%"))

@@ -33,6 +33,8 @@ COARSE = "pipeline, coarse"
 REFINED = "pipeline, refined"
 REFINED_ALL = "pipeline, all refined"
 REFINE_ONE = "refinement of 1 hypothesis"
+CANDIDATES = "candidates for re-ranking"
+RETRIEVAL = "retrieval"
 _WITH_EXTRACTOR = ", with extractor"
 
 
@@ -204,8 +206,8 @@ def stage_tasks(
         tasks.append(task("words and bag of words", call, note="a part of retrieval"))
     if retriever is not stages.retriever:
         candidates = partial(retriever, *inputs["retriever"])
-        tasks.append(task("candidates for re-ranking", candidates, note="a part of retrieval"))
-    tasks.append(task("retrieval", partial(stages.retriever, *inputs["retriever"])))
+        tasks.append(task(CANDIDATES, candidates, note="a part of retrieval"))
+    tasks.append(task(RETRIEVAL, partial(stages.retriever, *inputs["retriever"])))
     tasks += [
         task("template gather", partial(representation.gather_templates, coarse.templates.index)),
         task("matching", partial(stages.matcher, *inputs["matcher"])),

@@ -4,7 +4,7 @@ import pytest
 
 from benchmarking.checks import make_checks
 from benchmarking.curves import Curve, Point
-from benchmarking.inference import COARSE, HOOKED, REFINE_ONE, YARDSTICK
+from benchmarking.inference import CANDIDATES, COARSE, HOOKED, REFINE_ONE, RETRIEVAL, YARDSTICK
 from benchmarking.onboarding import BAGS, KMEANS, PCA, RENDERING, WHOLE
 from benchmarking.references import Comparison
 from benchmarking.report import BenchmarkResult, duration, render, write_report
@@ -39,6 +39,8 @@ ROWS = [
     row(YARDSTICK, 8.0, 16),
     row(REFINE_ONE, 0.32, 16),
     row(COARSE, 0.8, 16, group="pipeline", facts={"poses_found": 1.0}),
+    row(CANDIDATES, 0.064, 16),
+    row(RETRIEVAL, 0.16, 16),
     row(RENDERING, 3.2, 16, group="onboarding", unit="template", units=64, projected=40.0),
     row(PCA, 2.0, None, group="onboarding", unit="object"),
     row(BAGS, 3.5, None, group="onboarding", unit="object"),
@@ -61,6 +63,8 @@ def test_checks_on_a_cpu():
         "all coarse stages but the extractor, batch 1, share of the yardstick": (8.0, True),
         "the same in time; a quarter of the released code's on a machine with two cores": (40.0, False),
         "refinement of 1 hypothesis, batch 1, share of the yardstick": (12.0, False),
+        "all coarse stages but the extractor, batch 16, share of the yardstick": (10.0, True),
+        "re-ranking, batch 16, per crop": (6.0, False),
         "coarse stages, per crop at batch 16 beside batch 1": (125.0, False),
         "refinement of 1 hypothesis, per crop at batch 16 beside batch 1": (pytest.approx(33.333333), True),
         "rendering of all templates": (40.0, True),
@@ -107,7 +111,7 @@ def result():
 
 
 def test_shares(result):
-    refine, coarse, rendering = ROWS[2], ROWS[6], ROWS[7]
+    refine, coarse, rendering = ROWS[2], ROWS[6], ROWS[9]
     assert result.share(refine, YARDSTICK) == pytest.approx(0.12)
     assert result.share(refine, HOOKED) == pytest.approx(0.15)
     assert result.share(coarse, YARDSTICK) == pytest.approx(0.1)
