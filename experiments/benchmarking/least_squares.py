@@ -78,7 +78,7 @@ def featuremetric_least_squares(
     def residuals(parameters: Array) -> Array:
         y = camera(parameters) @ K.T
         pixels = y[:, :2] / y[:, 2:]
-        sampled = _bilinear(features, (pixels - problem.offset) / problem.stride)
+        sampled = _bilinear(features, (pixels - problem.grid.offset) / problem.grid.stride)
         outside = (pixels < -0.5) | (pixels > problem.image_size - 0.5)
         # A patch out of sight counts about the ceiling, as in ours.
         lost = outside.any(1) | (y[:, 2] <= 0)

@@ -33,6 +33,7 @@ from foundpose.onboarding.onboarder import describe_by_words
 from foundpose.rendering import Mesh
 from foundpose.representation import ObjectRepresentation, RepresentationInfo
 from foundpose.retrieval import SoftAssignBow
+from foundpose.utils.settings import identity
 
 SEMI_AXES = (50.0, 45.0, 40.0)
 """Of the object, in mm."""
@@ -215,7 +216,7 @@ def _representation(
             stride=PATCH,
             offset=(PATCH - 1) / 2,
             grid=sizes.grid,
-            settings={"fill": sizes.fill, "bow": repr(bow)},
+            settings={"fill": sizes.fill, "bow": identity(bow)},
         ),
     ).to(device)
     with torch.no_grad():

@@ -1,11 +1,11 @@
 """What every patch extractor provides."""
 
-import math
 from abc import ABC, abstractmethod
 from typing import NamedTuple
 
-import torch
 from torch import Tensor, nn
+
+from foundpose.geometry.patch_grid import PatchGrid
 
 Fingerprint = dict[str, str | int | float | bool | None]
 
@@ -57,13 +57,6 @@ class PatchExtractor(nn.Module, ABC):
         """
         return None
 
-    def grid_size(self, image_size: int) -> int:
-        """Number of patches along one side of an image of ``image_size`` pixels; 0 where not one fits."""
-        return max(0, math.floor((image_size - 1 - 2 * self.offset) / self.stride + 1e-6) + 1)
-
-    def patch_centers(self, image_size: int, device: torch.device, dtype: torch.dtype) -> Tensor:
-        """Pixel coordinates (h, w, 2) of the patch centres as ``(u, v)``."""
-        n = self.grid_size(image_size)
-        axis = torch.arange(n, device=device, dtype=dtype) * self.stride + self.offset
-        v, u = torch.meshgrid(axis, axis, indexing="ij")
-        return torch.stack([u, v], dim=-1)
+    def patch_grid(self, image_size: int) -> PatchGrid:
+        """Where the patches of an image of ``image_size`` pixels lie."""
+        return PatchGrid.of_picture(self.stride, self.offset, image_size)

@@ -87,10 +87,10 @@ class DenseSift(PatchExtractor):
             raise ValueError(
                 f"images of {images.shape[-1]} px have no patch; at least {smallest} px are needed"
             )
-        n = self.grid_size(images.shape[-1])
+        n = self.patch_grid(images.shape[-1]).size
         # half precision loses the small gradients that descriptors are made of
         gray = rgb_to_grayscale(images.to(torch.promote_types(images.dtype, torch.float32)))
-        centers = self.patch_centers(images.shape[-1], images.device, gray.dtype).flatten(0, 1)
+        centers = self.patch_grid(images.shape[-1]).centers(images.device, gray.dtype).flatten(0, 1)
         maps = []
         for support in self.supports:
             windows = sample_windows(gray, centers, support, self.window_size, self.smoothing * support)

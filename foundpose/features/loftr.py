@@ -85,7 +85,7 @@ class LoftrBackbone(PretrainedExtractor):
         found = self.model(rgb_to_grayscale(pixels))
         features = found if self.level == "coarse" else found[1]
         features = features.to(torch.promote_types(features.dtype, torch.float32))
-        centers = self.patch_centers(pixels.shape[-1], pixels.device, features.dtype)
+        centers = self.patch_grid(pixels.shape[-1]).centers(pixels.device, features.dtype)
         return PatchFeatures(sample_cells(features, centers, self.map_stride, 0), None)
 
 

@@ -58,7 +58,7 @@ class CoordinateCode(PatchExtractor):
         if images.dim() != 4 or images.shape[1] != 3 or images.shape[2] != images.shape[3]:
             raise ValueError(f"images must have shape (B, 3, S, S), got {tuple(images.shape)}")
         size = images.shape[-1]
-        centres = self.patch_centers(size, images.device, images.dtype)
+        centres = self.patch_grid(size).centers(images.device, images.dtype)
         sampling = ((2 * centres + 1) / size - 1).expand(len(images), -1, -1, -1)
         colors = F.grid_sample(images, sampling, align_corners=False).permute(0, 2, 3, 1)
         coordinates = (colors - _COLOR_CENTRE) / _COLOR_RANGE

@@ -13,6 +13,7 @@ from foundpose.geometry.cameras import (
     unproject_pixels,
 )
 from foundpose.geometry.crop import Crops, PerspectiveCrop
+from foundpose.geometry.patch_grid import PatchGrid
 from foundpose.geometry.symmetries import (
     Symmetries,
     axis_rotation,
@@ -39,6 +40,7 @@ from foundpose.geometry.viewpoints import (
 
 __all__ = [
     "Crops",
+    "PatchGrid",
     "PerspectiveCrop",
     "SphereInplane",
     "SuperFibonacci",

@@ -79,7 +79,7 @@ class CachedOnboarding:
             "renderings": self.artefacts.key("renderings", renderings),
             "stride": extractor.stride,
             "offset": extractor.offset,
-            "grid": extractor.grid_size(onboarder.image_size),
+            "grid": extractor.patch_grid(onboarder.image_size).size,
             "mask_erosion": onboarder.mask_erosion,
         }
         descriptors = {

@@ -246,10 +246,8 @@ class Onboarder(nn.Module):
     def register(self, mesh: Mesh, cameras: TemplateCameras, masks: Tensor) -> PatchTable:
         """Find the valid patches of some templates and their 3D points."""
         extractor = self.extractor
-        grid = extractor.grid_size(self.image_size)
-        found = register_patches(
-            self.renderer, mesh, cameras, masks, extractor.stride, extractor.offset, grid, self.mask_erosion
-        )
+        grid = extractor.patch_grid(self.image_size)
+        found = register_patches(self.renderer, mesh, cameras, masks, grid, self.mask_erosion)
         valid = found.valid.flatten(1)
         points_model = found.points_model.flatten(1, 2)[valid]
         return PatchTable(points_model, torch.nonzero(valid)[:, 1], valid.sum(dim=1))
@@ -275,7 +273,7 @@ class Onboarder(nn.Module):
         """Describe so many pictures of nothing, with all their patches."""
         extractor, size = self.extractor, self.image_size
         levels = torch.zeros(samples, 3, size, size, dtype=torch.uint8)
-        cells = torch.arange(extractor.grid_size(size) ** 2)
+        cells = torch.arange(extractor.patch_grid(size).size ** 2)
         counts = torch.full((samples,), len(cells))
         self.describe(levels, PatchTable(torch.empty(0, 3), cells.repeat(samples), counts))
 
@@ -318,7 +316,7 @@ class Onboarder(nn.Module):
     ) -> ObjectRepresentation:
         """Describe the templates by words and put the representation together, on the extractor's device."""
         device = self.device
-        grid = self.extractor.grid_size(self.image_size)
+        grid = self.extractor.patch_grid(self.image_size).size
         cell_type = torch.int16 if grid**2 <= torch.iinfo(torch.int16).max else torch.int32
         words, counts = fitted.words, patches.counts
         representation = ObjectRepresentation(

@@ -16,6 +16,7 @@ from foundpose.geometry import (
     transform_points,
     unproject_pixels,
 )
+from foundpose.geometry.patch_grid import PatchGrid
 from foundpose.rendering import Mesh, Renderer
 
 
@@ -78,9 +79,7 @@ def register_patches(
     mesh: Mesh,
     cameras: TemplateCameras,
     masks: Tensor,
-    stride: float,
-    offset: float,
-    grid: int,
+    grid: PatchGrid,
     erosion: int,
 ) -> RegisteredPatches:
     """Find the 3D point behind the centre of every patch (paper, "Patch descriptors registered in 3D").
@@ -92,36 +91,25 @@ def register_patches(
         mesh: the object.
         cameras: of B templates.
         masks: (B, S, S) bool, masks of the templates.
-        stride: distance of patch centres in pixels.
-        offset: coordinate of the first patch centre in pixels.
-        grid: number of patches along a side.
+        grid: where their patches lie.
         erosion: a patch is valid if its centre lies inside the mask eroded by a square of this many pixels
             (odd; 0 or 1 for no erosion).
     """
     T, K = cameras
     # Intrinsics of an image whose pixel centres are the patch centres.
-    to_grid = K.new_tensor(
-        [[1 / stride, 0.0, -offset / stride], [0.0, 1 / stride, -offset / stride], [0, 0, 1]]
-    )
-    K_grid = to_grid @ K
-    render = renderer(mesh, T, K_grid, (grid, grid))
+    scale, shift, n = 1 / grid.stride, -grid.offset / grid.stride, grid.size
+    K_grid = K.new_tensor([[scale, 0.0, shift], [0.0, scale, shift], [0, 0, 1]]) @ K
+    render = renderer(mesh, T, K_grid, (n, n))
     inside = masks.to(K.dtype)[:, None]
     if erosion > 1:
         # Beyond the border counts as inside, so that only the silhouette is eroded.
         outside = F.max_pool2d(1.0 - inside, (erosion, 1), stride=1, padding=(erosion // 2, 0))
         inside = 1.0 - F.max_pool2d(outside, (1, erosion), stride=1, padding=(0, erosion // 2))
-    side = masks.shape[-1]
-    centres = (torch.arange(grid, device=K.device, dtype=K.dtype) * stride + offset) * (2 / side) + (
-        1 / side - 1
-    )
-    v, u = torch.meshgrid(centres, centres, indexing="ij")
-    sampling = torch.stack([u, v], dim=-1).expand(len(masks), -1, -1, -1)
-    share = F.grid_sample(inside, sampling, align_corners=False)[:, 0]
-    valid = render.mask & (share > 0.999)
-    pixels = pixel_grid(grid, grid, K.device, K.dtype).reshape(1, -1, 2)
+    valid = render.mask & (grid.sample(inside)[:, 0] > 0.999)
+    pixels = pixel_grid(n, n, K.device, K.dtype).reshape(1, -1, 2)
     points_template = unproject_pixels(pixels, render.depth.flatten(1), K_grid)
     points_model = transform_points(invert_transform(T), points_template)
-    points_model = points_model.reshape(len(masks), grid, grid, 3)
+    points_model = points_model.reshape(len(masks), n, n, 3)
     return RegisteredPatches(
         torch.where(valid[..., None], points_model, torch.zeros_like(points_model)), valid
     )

@@ -1,7 +1,6 @@
 """The patches of crops: which of them count, and their descriptors."""
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from foundpose.features.base import PatchExtractor, PatchFeatures
@@ -25,12 +24,9 @@ def select_query_patches(features: PatchFeatures, crops: Crops, extractor: Patch
     Differentiable w.r.t. the features.
     """
     size = crops.images.shape[-1]
-    pixels = extractor.patch_centers(size, crops.masks.device, crops.masks.dtype)
-    grid = (2 * pixels + 1) / size - 1
-    share = F.grid_sample(
-        crops.masks[:, None], grid.expand(len(crops.masks), -1, -1, -1), align_corners=False
-    )
-    valid = (share.flatten(1) > 0.5) & crops.valid[:, None]
+    grid = extractor.patch_grid(size)
+    pixels = grid.centers(crops.masks.device, crops.masks.dtype)
+    valid = (grid.sample(crops.masks[:, None]).flatten(1) > 0.5) & crops.valid[:, None]
     if features.patches.shape[-2:] != pixels.shape[:2]:
         raise ValueError(
             f"the extractor declares a grid of {tuple(pixels.shape[:2])} patches for crops of {size} px but "

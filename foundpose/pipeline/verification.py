@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from foundpose.geometry import project_points, transform_points
-from foundpose.representation import ObjectRepresentation, RepresentationInfo
+from foundpose.representation import ObjectRepresentation
 from foundpose.retrieval import QueryPatches
 from foundpose.retrieval.base import normalize_rows, spread_patches
 
@@ -141,14 +141,14 @@ def pose_agreement(
     patches = representation.gather_templates(views, components=1)  # their places; few descriptors are needed
     points = transform_points(T_crop_from_model, patches.points_model.to(T_crop_from_model))
     pixels, depth = project_points(points, K_crop.unsqueeze(1))
-    landed = (pixels - info.offset) / info.stride  # (B, n, Q, 2) cells
+    landed = info.patch_grid.to_map(pixels)  # (B, n, Q, 2) cells
     usable = patches.valid & (depth > 0) & torch.isfinite(landed).all(dim=-1)
     # Far outside, where nothing is.
     landed = torch.where(usable.unsqueeze(-1), landed, landed.new_tensor(-1e4))
 
-    inside = _mark(_cells(query, info).round().long(), query.valid, info.grid)
+    inside = _mark(info.patch_grid.to_map(query.pixels).round().long(), query.valid, info.grid)
     query = spread_patches(query, max_patches)
-    at_query = _cells(query, info).to(landed)
+    at_query = info.patch_grid.to_map(query.pixels).to(landed)
     distance = torch.cdist(at_query.unsqueeze(1).expand(-1, n, -1, -1), landed)
     nearest = distance.min(dim=3)
     seen = (nearest.values < _SEEN_WITHIN) & query.valid.unsqueeze(1)
@@ -170,11 +170,6 @@ def pose_agreement(
     both = (covered & inside.unsqueeze(1)).sum(dim=2)
     either = (covered | inside.unsqueeze(1)).sum(dim=2)
     return Agreement(similarity, both / either.clamp(min=1))
-
-
-def _cells(query: QueryPatches, info: RepresentationInfo) -> Tensor:
-    """Places (B, P, 2) of a crop's patches in the grid, as (column, row)."""
-    return (query.pixels - info.offset) / info.stride
 
 
 def _mark(cells: Tensor, which: Tensor, grid: int) -> Tensor:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 from torch import Tensor, nn
 
 from foundpose.features import PatchFeatures
-from foundpose.geometry import Crops
+from foundpose.geometry import Crops, PatchGrid
 from foundpose.rendering import Mesh
 from foundpose.representation import ObjectRepresentation
 
@@ -21,10 +21,8 @@ class PoseProposals(NamedTuple):
         valid: (B, n) bool; poses that are not valid are finite but mean nothing.
         template_index: (B, n) the template that each pose comes from, int64.
         crops: the perspective crops.
-        features: their raw patch descriptors (B, C, h, w); cell (row, column) is centred at pixel
-            ``(stride * column + offset, stride * row + offset)`` of the crop.
-        stride: distance of patch centres in pixels.
-        offset: pixel coordinate of the first patch centre.
+        features: their raw patch descriptors (B, C, h, w).
+        grid: where these patches lie.
         objects: representations of the objects.
         object_index: (B,) which object each crop shows, int64 on the CPU.
         images: (N, 3, H, W) the pictures that the crops were cut from.
@@ -39,8 +37,7 @@ class PoseProposals(NamedTuple):
     template_index: Tensor
     crops: Crops
     features: PatchFeatures
-    stride: float
-    offset: float
+    grid: PatchGrid
     objects: Sequence[ObjectRepresentation]
     object_index: Tensor
     images: Tensor

@@ -5,6 +5,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from foundpose.geometry import PatchGrid
 from foundpose.optimization import (
     BarronLoss,
     Differentiation,
@@ -32,8 +33,7 @@ class AlignmentProblem(NamedTuple):
     Attributes:
         features: (m, h, w, d) projected feature maps of crops, channels last.
         map_index: (n,) which map belongs to each pose, int64.
-        stride: distance of the map's cells in pixels.
-        offset: pixel coordinate of the first cell's centre.
+        grid: where the map's cells lie in the crop.
         image_size: side of the crops in pixels.
         K: (n, 3, 3) intrinsics of the crops.
         descriptors: (n, P, d) of the template's patches.
@@ -45,8 +45,7 @@ class AlignmentProblem(NamedTuple):
 
     features: Tensor
     map_index: Tensor
-    stride: float
-    offset: float
+    grid: PatchGrid
     image_size: int
     K: Tensor
     descriptors: Tensor
@@ -354,11 +353,11 @@ def _residual_rows(
     inside = ((pixels >= -0.5) & (pixels <= problem.image_size - 0.5)).all(1)
     seen = problem.valid & (depth > 0) & inside
     pixels = torch.where(seen.unsqueeze(1), pixels, torch.zeros_like(pixels))
-    position = ((pixels - problem.offset) / problem.stride).transpose(1, 2)
+    position = problem.grid.to_map(pixels).transpose(1, 2)
     rows = sample_features(
         problem.features, problem.map_index, position, interpolation, goal.minus_descriptors
     )
-    J = torch.where(seen[:, None, None], J, torch.zeros_like(J)) / problem.stride
+    J = torch.where(seen[:, None, None], J, torch.zeros_like(J)) / problem.grid.stride
     return rows, seen, J
 
 

@@ -145,8 +145,7 @@ def alignment_problem(proposals: PoseProposals, num_views: int | None = None) ->
     return AlignmentProblem(
         features=torch.cat(maps)[back],
         map_index=torch.arange(B, device=device).repeat_interleave(n),
-        stride=proposals.stride,
-        offset=proposals.offset,
+        grid=proposals.grid,
         image_size=proposals.crops.images.shape[-1],
         K=proposals.crops.K_crop.to(dtype).repeat_interleave(n, dim=0),
         descriptors=descriptors,

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from foundpose.features.base import Fingerprint, PatchExtractor
 from foundpose.features.pca import PcaProjection
+from foundpose.geometry.patch_grid import PatchGrid
 from foundpose.representation.quantization import DescriptorCodec, Storage, codec_from_state, compress
 from foundpose.utils.files import write_atomically
 
@@ -50,6 +51,11 @@ class RepresentationInfo:
     settings: dict[str, str | int | float | bool | None] = field(default_factory=dict)
     schema_version: int = SCHEMA_VERSION
     scales: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def patch_grid(self) -> PatchGrid:
+        """Where the patches of the templates lie."""
+        return PatchGrid(self.stride, self.offset, self.grid)
 
     def scale(self, name: str, setting: str) -> float:
         """A scale of the descriptors, for a setting that is "auto".
@@ -198,8 +204,7 @@ class ObjectRepresentation(nn.Module):
         points = self.points_model.index_select(0, rows.flatten()).unflatten(0, rows.shape)
         points_model = torch.where(keep, points, points.new_zeros(()))
         cell = self.patch_index[rows].long()
-        columns_rows = torch.stack([cell % self.info.grid, cell // self.info.grid], dim=-1)
-        pixels = columns_rows.to(self.points_model.dtype) * self.info.stride + self.info.offset
+        pixels = self.info.patch_grid.pixels_of(cell, self.points_model.dtype)
         return TemplatePatches(descriptors, points_model, pixels, valid)
 
     def nearest_views(self, T_camera_from_model: Tensor, count: int = 1) -> Tensor:

@@ -125,9 +125,9 @@ class SpatialReranker(Retriever):
         x = normalize_rows(x).unsqueeze(1)
         cosine = x @ normalize_rows(patches.descriptors.to(x)).transpose(-1, -2)  # (b, h, P, Q)
         if self.position_weight > 0:
-            stride = index.info.stride
-            at_crop = (query.pixels[rows] / stride).unsqueeze(1).expand(-1, cosine.shape[1], -1, -1)
-            at_template = (patches.pixels.to(at_crop) / stride).masked_fill(
+            to_map = index.info.patch_grid.to_map
+            at_crop = to_map(query.pixels[rows]).unsqueeze(1).expand(-1, cosine.shape[1], -1, -1)
+            at_template = to_map(patches.pixels.to(at_crop)).masked_fill(
                 ~patches.valid.unsqueeze(-1), _FAR_AWAY
             )
             with torch.no_grad():

@@ -101,9 +101,7 @@ def render_templates(mesh: Mesh, rotations: Tensor, onboarder: Onboarder) -> Tem
         mesh,
         cameras,
         render.mask,
-        extractor.stride,
-        extractor.offset,
-        extractor.grid_size(size),
+        extractor.patch_grid(size),
         onboarder.mask_erosion,
     )
     return TemplateViews(render.rgb, cameras, patches)

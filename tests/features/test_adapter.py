@@ -162,7 +162,7 @@ def test_adapted_extractor_changes_patches_alone(tmp_path, generator):
     cell = adapter(plain.patches[1, :, 3, 2])
     assert torch.allclose(features.patches[1, :, 3, 2], cell, atol=1e-6)
     assert not torch.allclose(features.patches, plain.patches, atol=1e-2)
-    assert extractor.grid_size(70) == inner.grid_size(70)
+    assert extractor.patch_grid(70).size == inner.patch_grid(70).size
     # Alone as in a batch.
     assert torch.allclose(extractor(images[1:]).patches[0], features.patches[1], atol=1e-6)
     # From a file.

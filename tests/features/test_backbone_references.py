@@ -121,7 +121,7 @@ def test_tokens_land_on_the_patch_centres(make_extractor, size) -> None:
     pass_patches_through(extractor, *IMAGENET)
     with torch.no_grad():
         found = extractor(ramp()).patches[0, :2] * 420
-    centers = extractor.patch_centers(420, found.device, found.dtype).permute(2, 0, 1)
+    centers = extractor.patch_grid(420).centers(found.device, found.dtype).permute(2, 0, 1)
     # at the border enlarging repeats the outermost pixels, which moves the outermost tokens by 0.01 px
     torch.testing.assert_close(found, centers, atol=0.03, rtol=0)
     # coordinates up to 420 px through products in single precision: some 1e-5 of them, as the machine sums
@@ -168,6 +168,6 @@ def test_s2dnet_is_centred_on_the_patches(layer: str) -> None:
         extractor.std.fill_(1)
         upper = extractor(ramp(210)).patches[0, :2] * 210
         lower = (1 - extractor(1 - ramp(210)).patches[0, :2]) * 210
-    centers = extractor.patch_centers(210, upper.device, upper.dtype).permute(2, 0, 1)
+    centers = extractor.patch_grid(210).centers(upper.device, upper.dtype).permute(2, 0, 1)
     torch.testing.assert_close((upper + lower)[:, 1:-1, 1:-1] / 2, centers[:, 1:-1, 1:-1], atol=2e-3, rtol=0)
     assert (upper - lower).mean() > 1 or layer == "conv1_2"

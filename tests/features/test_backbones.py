@@ -44,7 +44,7 @@ def test_crop_of_the_paper_has_30_by_30_patches(name: str) -> None:
     with torch.no_grad():
         out = extractor(torch.rand(1, 3, 420, 420))
     assert out.patches.shape == (1, extractor.channels, 30, 30)
-    assert (extractor.stride, extractor.offset, extractor.grid_size(420)) == (14, 6.5, 30)
+    assert (extractor.stride, extractor.offset, extractor.patch_grid(420).size) == (14, 6.5, 30)
 
 
 def test_sam_at_its_own_resolution() -> None:

@@ -61,7 +61,7 @@ def test_agrees_with_opencv(support: float) -> None:
     module = DenseSift(supports=(support,), contrast=0.0)
     found = module(images).patches.flatten(2).transpose(1, 2)
     found = convert_sift_descriptor_layout(found, "kornia", "opencv")
-    centers = module.patch_centers(280, images.device, images.dtype).flatten(0, 1).numpy()
+    centers = module.patch_grid(280).centers(images.device, images.dtype).flatten(0, 1).numpy()
     inside = ((centers > support) & (centers < 279 - support)).all(-1)
     sift = cv2.SIFT_create()
     keypoints = [cv2.KeyPoint(float(u), float(v), support / 6, 0.0, 1.0, 0) for u, v in centers[inside]]
@@ -88,7 +88,7 @@ def test_nearest_neighbours_agree_with_opencv() -> None:
     image = natural_images(1, 280, seed=3)
     module = DenseSift(supports=(28.0,), contrast=0.0)
     found = module(image).patches[0].flatten(1).T
-    centers = module.patch_centers(280, image.device, image.dtype).flatten(0, 1).numpy()
+    centers = module.patch_grid(280).centers(image.device, image.dtype).flatten(0, 1).numpy()
     inside = ((centers > 28) & (centers < 251)).all(-1)
     gray = ndimage.gaussian_filter(rgb_to_grayscale(image)[0, 0].numpy(), ((28 / 12) ** 2 - 2.31) ** 0.5)
     keypoints = [cv2.KeyPoint(float(u), float(v), 28 / 6, 0.0, 1.0, 0) for u, v in centers[inside]]

@@ -38,7 +38,7 @@ def test_paper_setting_at_full_resolution() -> None:
     with torch.no_grad():
         out = extractor(torch.rand(1, 3, 420, 420))
     assert out.patches.shape == (1, 384, 30, 30)
-    assert (extractor.stride, extractor.offset, extractor.grid_size(420)) == (14, 6.5, 30)
+    assert (extractor.stride, extractor.offset, extractor.patch_grid(420).size) == (14, 6.5, 30)
     assert extractor.channels == 384
 
 

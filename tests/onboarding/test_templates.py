@@ -3,7 +3,7 @@ import pytest
 import torch
 from scipy.ndimage import binary_erosion
 
-from foundpose.geometry import SuperFibonacci, project_points, transform_points
+from foundpose.geometry import PatchGrid, SuperFibonacci, project_points, transform_points
 from foundpose.onboarding import TemplateCameras, register_patches, template_cameras
 from foundpose.rendering import RaycastRenderer
 
@@ -42,7 +42,7 @@ def test_cameras_keep_their_distance_and_orientation(views, blob):
 @pytest.mark.parametrize(("stride", "offset", "grid"), [(14.0, 6.5, 30), (7.0, 3.0, 60)])
 def test_patches_are_registered_at_their_centres(views, blob, erosion, stride, offset, grid):
     cameras, render, renderer = views
-    patches = register_patches(renderer, blob, cameras, render.mask, stride, offset, grid, erosion)
+    patches = register_patches(renderer, blob, cameras, render.mask, PatchGrid(stride, offset, grid), erosion)
     axis = torch.arange(grid) * stride + offset
     centres = torch.stack(torch.meshgrid(axis, axis, indexing="xy"), dim=-1)
     for b in range(len(render.mask)):

@@ -6,10 +6,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from foundpose.geometry import PatchGrid
 from foundpose.geometry.transforms import make_transform, se3_exp, transform_points
 from foundpose.refinement import AlignmentProblem, sample_features
 
 SIZE, STRIDE, OFFSET = 140, 14.0, 6.5
+GRID = PatchGrid(STRIDE, OFFSET, 10)
 
 
 def true_pose(dtype: torch.dtype = torch.float64) -> Tensor:
@@ -52,7 +54,7 @@ def make_problem(
     p = sample_features(features, index, (pixels - OFFSET) / STRIDE, "bicubic")[..., 0, :]
     p = p + noise * torch.from_numpy(rng.normal(size=p.shape))
     valid = torch.ones(n, points, dtype=torch.bool)
-    problem = AlignmentProblem(features, index, STRIDE, OFFSET, SIZE, K, p, x, valid)
+    problem = AlignmentProblem(features, index, GRID, SIZE, K, p, x, valid)
     return cast(problem, dtype), T.to(dtype)
 
 

@@ -7,6 +7,7 @@ from torch import Tensor, nn
 
 from foundpose.geometry import (
     Crops,
+    PatchGrid,
     PerspectiveCrop,
     intrinsics_matrix,
     make_transform,
@@ -72,8 +73,7 @@ def propose(setting, T, valid=None, meshes="own", score=None):
         template_index=torch.zeros(4, n, dtype=torch.int64),
         crops=crops,
         features=None,
-        stride=14.0,
-        offset=6.5,
+        grid=PatchGrid(14.0, 6.5, 30),
         objects=[None],
         object_index=torch.zeros(4, dtype=torch.int64),
         images=setting.images,
