@@ -99,7 +99,9 @@ def test_stages_run_on_what_the_pipeline_hands_them(stages, workload):
     assert list(tasks) == [
         *("backbone", "crop", "query patches", "PCA projection", "words and bag of words"),
         *("candidates for re-ranking", "retrieval"),
-        *("template gather", "matching", "PnP of 5 hypotheses", "PnP of 5 hypotheses, epnp"),
+        *("template gather", "matching", "PnP of 5 hypotheses"),
+        *("templates' own poses", "polish of the templates' poses", "verification"),
+        "PnP of 5 hypotheses, epnp",
         *(REFINE_ONE, "refinement of 5 hypotheses"),
     ]
     assert backbone.calls == 1
