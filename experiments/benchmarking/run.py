@@ -116,10 +116,10 @@ def make_stages(
     cfg = copy.deepcopy(cfg)
     cfg.crop.size, cfg.crop.fill = sizes.crop_size, sizes.fill
     alignments = ("refiner.alignment", "refiners.featuremetric.alignment")
-    _set_where_known(cfg, "retrieval.num_templates", hypotheses or cfg.hypotheses)
+    _set_where_known(cfg, "retrieval.num_templates", hypotheses or cfg.num_hypotheses)
     candidates = OmegaConf.select(cfg, "retrieval.retriever.num_templates")
     if candidates is not None:  # of which re-ranking keeps the templates
-        cfg.retrieval.retriever.num_templates = max(candidates, hypotheses or cfg.hypotheses)
+        cfg.retrieval.retriever.num_templates = max(candidates, hypotheses or cfg.num_hypotheses)
     _set_where_known(cfg, "pnp.iterations", ransac_iterations or cfg.ransac_iterations)
     for node in alignments:
         _set_where_known(cfg, f"{node}.max_iterations", lm_iterations or cfg.lm_iterations)
@@ -191,7 +191,7 @@ def _check(cfg: DictConfig) -> None:
     curves = [name for name in cfg.curves if name not in AXES]
     if curves:
         raise ValueError(f"there is no curve {curves[0]!r}; choose from {list(AXES)}")
-    for name in ("hypotheses", "ransac_iterations", "lm_iterations", "crops_per_image"):
+    for name in ("num_hypotheses", "ransac_iterations", "lm_iterations", "crops_per_image"):
         if not isinstance(cfg[name], int) or cfg[name] < 1:
             raise ValueError(f"{name} must be a positive integer, got {cfg[name]}")
     if cfg.threads is not None and (not isinstance(cfg.threads, int) or cfg.threads < 1):

@@ -66,7 +66,7 @@ def test_other_stages_and_double_precision(monkeypatch, tmp_path):
     run_app(
         monkeypatch,
         *("quick=true", "groups=[stages,pipeline,references]", "batch_sizes=[2]", "dtype=float64"),
-        *("extractor=dense_sift", "pnp=epnp_ransac", "~refiner", "matcher=soft", "hypotheses=2"),
+        *("extractor=dense_sift", "pnp=epnp_ransac", "~refiner", "matcher=soft", "num_hypotheses=2"),
         *("sizes.templates=30", f"hydra.run.dir={tmp_path}"),
     )
     content = json.loads((tmp_path / "benchmark.json").read_text())
@@ -87,7 +87,7 @@ def test_other_stages_and_double_precision(monkeypatch, tmp_path):
         ("batch_sizes=3", "batch_sizes must be a list of positive integers"),
         ("dtype=float16", "dtype must be one of ['float32', 'float64'], got 'float16'"),
         ("+curves.colour=[1]", "there is no curve 'colour'"),
-        ("hypotheses=0", "hypotheses must be a positive integer, got 0"),
+        ("num_hypotheses=0", "num_hypotheses must be a positive integer, got 0"),
         ("threads=0", "threads must be a positive integer or null, got 0"),
         ("measure.repeats=0", "repeats must be at least 1, got 0"),
         ("sizes.crop_size=425", "crop_size must be a multiple of 14 px"),
