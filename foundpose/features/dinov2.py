@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Self
 
-import torch
 from torch import Tensor, nn
 
 from foundpose.features.base import Fingerprint, PatchFeatures
@@ -102,31 +101,6 @@ class DinoV2(PretrainedExtractor):
     def describe(self, pixels: Tensor) -> PatchFeatures:
         """Tokens of the hooked block."""
         return split_tokens(self.model(pixel_values=pixels).last_hidden_state, self.num_prefix_tokens)
-
-
-def resample_position_embeddings(embeddings: Tensor, rows: int, columns: int, offset: float = 0.1) -> Tensor:
-    """Resample position embeddings as the original DINOv2 (without registers) does.
-
-    Args:
-        embeddings: (1, 1 + n², C), that of the cls token first.
-        rows: new number of rows of patches.
-        columns: new number of columns.
-        offset: added to the new numbers when the scale factor is computed, not to the numbers themselves.
-
-    Returns:
-        (1, 1 + rows * columns, C). Differentiable w.r.t. ``embeddings``.
-    """
-    n = round((embeddings.shape[1] - 1) ** 0.5)
-    if rows == n and columns == n:
-        return embeddings
-    # bicubic in half precision would move the embeddings
-    grid = embeddings[:, 1:].to(torch.promote_types(embeddings.dtype, torch.float32))
-    grid = nn.functional.interpolate(
-        grid.unflatten(1, (n, n)).permute(0, 3, 1, 2),
-        scale_factor=((rows + offset) / n, (columns + offset) / n),
-        mode="bicubic",
-    )
-    return torch.cat([embeddings[:, :1], grid.flatten(2).transpose(1, 2).to(embeddings.dtype)], dim=1)
 
 
 def _original_embeddings(model: nn.Module) -> nn.Module:

@@ -3,8 +3,8 @@
 from torch import Tensor
 from transformers.models.dinov2.modeling_dinov2 import Dinov2Embeddings
 
-from foundpose.features.dinov2 import resample_position_embeddings
 from foundpose.features.dinov2_checkpoints import PATCH_SIZE
+from foundpose.features.resample import resample_position_embeddings
 
 
 class OriginalDinov2Embeddings(Dinov2Embeddings):

@@ -6,7 +6,8 @@ import pytest
 import torch
 from torch import nn
 
-from foundpose.features.dinov2 import DinoV2, resample_position_embeddings
+from foundpose.features.dinov2 import DinoV2
+from foundpose.features.resample import resample_position_embeddings
 from foundpose.features.weights import weights_checksum
 
 TINY = {"hidden_size": 32, "num_hidden_layers": 6, "num_attention_heads": 4, "image_size": 70}
