@@ -90,7 +90,7 @@ def expected_distinct(objects: int, crops: int) -> float:
     return objects * (1.0 - (1.0 - 1.0 / objects) ** crops)
 
 
-class Crops:
+class PreparedCrops:
     """Estimates the poses of prepared crops, one at a time."""
 
     def __init__(self, cfg: DictConfig, workload: Workload) -> None:
@@ -157,7 +157,7 @@ def measure(cfg: DictConfig, files: Path) -> list[Row]:
         raise ValueError(f"resident memory is read from {_STATUS}, which this system does not have")
     cfg = prepared(cfg)
     workload = make_workload(_sizes(cfg))
-    crops = Crops(cfg, workload)
+    crops = PreparedCrops(cfg, workload)
     crops.seconds(0, workload.representation)  # whatever is done once
     rows = []
     for name in cfg.storages:
@@ -212,7 +212,7 @@ def distinct_files(
             path.unlink(missing_ok=True)
 
 
-def measure_objects(name: str, paths: Sequence[Path], crops: Crops, count: int) -> Row:
+def measure_objects(name: str, paths: Sequence[Path], crops: PreparedCrops, count: int) -> Row:
     """Open files and estimate poses of crops of random objects among them, twice."""
     forget(paths)
     return_free_memory()

@@ -29,7 +29,7 @@ from foundpose.rendering import Mesh, load_mesh
 from foundpose.training import (
     AdapterTraining,
     PairDataModule,
-    PoseErrors,
+    SceneErrors,
     compare,
     evaluate_scenes,
     summarize,
@@ -174,12 +174,13 @@ def write_extractor(cfg: DictConfig, path: Path) -> None:
 
 def measure(
     cfg: DictConfig, mesh: Mesh, symmetries: Symmetries | None, kept: Path, title: str
-) -> dict[str, PoseErrors]:
+) -> dict[str, SceneErrors]:
     """Onboard the held-out object and estimate its pose in all scenes, or read the errors that were kept."""
     if kept.is_file():
         tensors = load_file(kept)
         return {
-            mode: PoseErrors(*(tensors[f"{mode}.{field}"] for field in PoseErrors._fields)) for mode in MODES
+            mode: SceneErrors(*(tensors[f"{mode}.{field}"] for field in SceneErrors._fields))
+            for mode in MODES
         }
     method = build_method(cfg)
     representation = method.store.get(mesh, "held-out", ProgressBars(title)).to(cfg.device)

@@ -13,7 +13,13 @@ from foundpose.pipeline import (
     PoseStatus,
     TemplateHypotheses,
 )
-from foundpose.pnp import GaussNewtonPnp, RansacPnp, SoftInlierSelection, TemplateStart, TopTemplatePose
+from foundpose.pnp import (
+    LevenbergMarquardtPnp,
+    RansacPnp,
+    SoftInlierSelection,
+    TemplateStart,
+    TopTemplatePose,
+)
 from foundpose.refinement import FeaturemetricRefiner, PoseRefiner, RefinerChain, RenderAndCompareRefiner
 from foundpose.rendering import Mesh, PyrenderRenderer, RaycastRenderer, load_mesh
 from foundpose.representation import ObjectRepresentation
@@ -35,8 +41,8 @@ __all__ = [
     "FeatureHook",
     "FeaturemetricRefiner",
     "FoundPose",
-    "GaussNewtonPnp",
     "InlierScore",
+    "LevenbergMarquardtPnp",
     "MatchAndSolve",
     "Mesh",
     "ObjectRepresentation",

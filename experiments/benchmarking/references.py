@@ -19,7 +19,7 @@ from benchmarking.numpy_method import match_by_template, retrieve_by_template
 from benchmarking.workload import Workload
 from foundpose.geometry import rotation_angle
 from foundpose.onboarding import Progress
-from foundpose.pnp import GaussNewtonPnp, RansacPnp
+from foundpose.pnp import LevenbergMarquardtPnp, RansacPnp
 from foundpose.refinement import FeaturemetricRefiner
 from foundpose.refinement.refiners import alignment_problem
 from foundpose.representation import ObjectRepresentation
@@ -245,7 +245,7 @@ def _polish_reference(pnp: RansacPnp, arguments: list[Any]) -> Reference:
     points_image, points_model, K = (x[:1] for x in arguments[:3])
     weights = found.inliers[:1].to(K.dtype)
     start = turned(found.T_camera_from_model[:1], points_model[0], degrees=1.0)
-    optimiser = GaussNewtonPnp(max_iterations=30)
+    optimiser = LevenbergMarquardtPnp(max_iterations=30)
     chosen = _numpy(found.inliers[0])
     x, u, k = (_numpy(t[0]).astype(np.float64) for t in (points_model, points_image, K))
     T = _numpy(start[0]).astype(np.float64)

@@ -19,7 +19,7 @@ from torch import Tensor
 from foundpose.clustering.assignment import cluster_means, find_nearest
 from foundpose.clustering.neighbourhoods import Neighbourhoods
 
-Progress = Callable[[int, float], None]
+OnIteration = Callable[[int, float], None]
 
 _RELAXATION = 1.8
 # All centroids are searched at least this often, where neighbourhoods are searched otherwise.
@@ -194,7 +194,7 @@ def kmeans(
     num_iterations: int = 25,
     seed: int = 0,
     tolerance: float = 1e-3,
-    progress: Progress | None = None,
+    progress: OnIteration | None = None,
 ) -> KMeansResult:
     """Cluster points.
 
@@ -234,7 +234,7 @@ def kmeans(
 
 
 def _iterate(
-    points: Tensor, centroids: Tensor, num_iterations: int, tolerance: float, progress: Progress | None
+    points: Tensor, centroids: Tensor, num_iterations: int, tolerance: float, progress: OnIteration | None
 ) -> tuple[Tensor, int]:
     """Centroids after at most ``num_iterations`` and the number of iterations made."""
     squared_norms = torch.linalg.vector_norm(points, dim=1).square()

@@ -1,7 +1,7 @@
 """Perspective-n-Point: minimal solvers, RANSAC, differentiable polish."""
 
 from foundpose.pnp.epnp import MinimalSolution, solve_epnp
-from foundpose.pnp.gauss_newton import GaussNewtonPnp, PnpOptimum
+from foundpose.pnp.levenberg_marquardt import LevenbergMarquardtPnp, PnpOptimum
 from foundpose.pnp.p3p import P3PSolutions, solve_p3p
 from foundpose.pnp.polish import polish_pnp
 from foundpose.pnp.ransac import PnpResult, PnpStatus, RansacPnp
@@ -10,7 +10,7 @@ from foundpose.pnp.template_pose import TemplatePoses, TopTemplatePose
 from foundpose.pnp.template_start import TemplateStart
 
 __all__ = [
-    "GaussNewtonPnp",
+    "LevenbergMarquardtPnp",
     "MinimalSolution",
     "P3PSolutions",
     "PnpOptimum",

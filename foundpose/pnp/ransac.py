@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from foundpose.geometry.cameras import pixel_rays
 from foundpose.geometry.transforms import make_transform
-from foundpose.pnp.gauss_newton import GaussNewtonPnp
+from foundpose.pnp.levenberg_marquardt import LevenbergMarquardtPnp
 from foundpose.pnp.polish import check_correspondences, invertible_intrinsics, usable_coordinates
 from foundpose.pnp.sampling import Hypotheses, SolverName, sample_hypotheses, sample_size
 from foundpose.pnp.scoring import reprojection_errors, select_inliers
@@ -88,7 +88,7 @@ class RansacPnp(nn.Module):
         mirror: also polish each pose's mirror image in depth and keep the better one: the projections of a flat
             object hardly tell the two apart, and samples often fall for the wrong one.
         polish: how; it decides on the robust loss and on the kind of gradient. None means
-            ``GaussNewtonPnp(max_iterations=10)``.
+            ``LevenbergMarquardtPnp(max_iterations=10)``.
         soft_selection: also return the best hypotheses with the probability of choosing them, for losses on the
             expected pose error (DSAC). The pose returned is the same as without.
         guidance: how much samples prefer correspondences of high priority, where priorities are given: the rank of
@@ -115,7 +115,7 @@ class RansacPnp(nn.Module):
         confidence: float | None = 0.9999,
         polish_rounds: int = 3,
         mirror: bool = True,
-        polish: GaussNewtonPnp | None = None,
+        polish: LevenbergMarquardtPnp | None = None,
         soft_selection: SoftInlierSelection | None = None,
         seed: int = 0,
         score_points: int | None = 128,
@@ -145,7 +145,7 @@ class RansacPnp(nn.Module):
         self.confidence = confidence
         self.polish_rounds = polish_rounds
         self.mirror = mirror
-        self.polish = GaussNewtonPnp(max_iterations=10) if polish is None else polish
+        self.polish = LevenbergMarquardtPnp(max_iterations=10) if polish is None else polish
         self.soft_selection = soft_selection
         self.score_points = score_points
         self.chunk = chunk

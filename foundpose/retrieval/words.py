@@ -2,7 +2,7 @@
 
 from torch import Tensor
 
-from foundpose.clustering.kmeans import Progress, kmeans
+from foundpose.clustering.kmeans import OnIteration, kmeans
 from foundpose.utils.settings import Configured, Setting
 
 
@@ -31,7 +31,7 @@ class VisualWords(Configured):
         self.tolerance = tolerance
         self.seed = seed
 
-    def forward(self, descriptors: Tensor, progress: Progress | None = None) -> Tensor:
+    def forward(self, descriptors: Tensor, progress: OnIteration | None = None) -> Tensor:
         """Cluster descriptors (N, d) to words (k, d).
 
         Args:

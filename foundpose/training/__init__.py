@@ -5,7 +5,7 @@ Imports pytorch_lightning, as only ``foundpose.evaluation`` does besides.
 
 from foundpose.training.adapter import AdapterTraining, PairLoss, PairPoses
 from foundpose.training.data import EpochShuffle, PairDataModule
-from foundpose.training.evaluation import PoseErrors, compare, evaluate_scenes, summarize
+from foundpose.training.evaluation import SceneErrors, compare, evaluate_scenes, summarize
 from foundpose.training.pairs import PairBatch, PairSettings, PatchPairs, make_pairs
 from foundpose.training.refiner import RefinerLoss, RefinerTraining, disentangled_error
 from foundpose.training.refiner_data import (
@@ -43,7 +43,6 @@ __all__ = [
     "PatchPairs",
     "Perturbation",
     "PictureSettings",
-    "PoseErrors",
     "RefinementErrors",
     "RefinerBatch",
     "RefinerDataModule",
@@ -51,6 +50,7 @@ __all__ = [
     "RefinerPictures",
     "RefinerTraining",
     "RendererPerMesh",
+    "SceneErrors",
     "TemplateViews",
     "TrueCrops",
     "compare",

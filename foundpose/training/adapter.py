@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from foundpose.features import ResidualAdapter
 from foundpose.losses import GeodesicRotationLoss, PointMatchingLoss, ProjectionLoss
 from foundpose.matching import SoftPatchMatcher
-from foundpose.pnp import GaussNewtonPnp, RansacPnp
+from foundpose.pnp import LevenbergMarquardtPnp, RansacPnp
 from foundpose.training.pairs import PairBatch
 
 
@@ -49,9 +49,9 @@ class AdapterTraining(pl.LightningModule):
     Args:
         adapter: what is trained, on both sides of a pair.
         matcher: matches adapted descriptors; its temperature is trained along if it is learnable.
-        pnp: estimates poses: :class:`GaussNewtonPnp` starts at the true pose, :class:`RansacPnp` finds its own start.
-            The less robust its loss, the more matches have a gradient. Pairs whose pose is no regular optimum, and
-            so has no gradient, do not count.
+        pnp: estimates poses: :class:`LevenbergMarquardtPnp` starts at the true pose, :class:`RansacPnp` finds its own
+            start. The less robust its loss, the more matches have a gradient. Pairs whose pose is no regular optimum,
+            and so has no gradient, do not count.
         loss: error of a pose, ``reduction="none"``: in diameters for :class:`PointMatchingLoss` (the default, with
             ``norm="l2"``), in pixels of the crop for :class:`ProjectionLoss`, in radians for
             :class:`GeodesicRotationLoss`. Any other module is called as the first of these is.
@@ -67,7 +67,7 @@ class AdapterTraining(pl.LightningModule):
         self,
         adapter: ResidualAdapter,
         matcher: SoftPatchMatcher,
-        pnp: GaussNewtonPnp | RansacPnp,
+        pnp: LevenbergMarquardtPnp | RansacPnp,
         loss: nn.Module | None = None,
         learning_rate: float = 1e-3,
         weight_decay: float = 0.0,

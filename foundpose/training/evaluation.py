@@ -23,7 +23,7 @@ RIGHT_DEGREES = 10.0
 RIGHT_DIAMETERS = 0.1
 
 
-class PoseErrors(NamedTuple):
+class SceneErrors(NamedTuple):
     """Errors of N poses, against whichever of the equivalent true poses of a symmetric object is nearest.
 
     Attributes:
@@ -72,7 +72,7 @@ def evaluate_scenes(
     batch_size: int = 8,
     progress: Progress | None = None,
     symmetries: Symmetries | None = None,
-) -> dict[str, PoseErrors]:
+) -> dict[str, SceneErrors]:
     """Estimate an object's pose in cluttered scenes.
 
     Args:
@@ -101,7 +101,7 @@ def evaluate_scenes(
             pipeline.refine,
         ).eval()
         device = representation.points_model.device
-        parts: dict[str, list[PoseErrors]] = {"retrieved": [], "nearest": []}
+        parts: dict[str, list[SceneErrors]] = {"retrieved": [], "nearest": []}
         for start in range(0, len(seeds), batch_size):
             chunk = seeds[start : start + batch_size]
             scenes = [
@@ -122,7 +122,7 @@ def evaluate_scenes(
             if progress is not None:
                 progress("scenes", start + len(chunk), len(seeds))
     return {
-        name: PoseErrors(*(torch.cat(field) for field in zip(*errors, strict=True)))
+        name: SceneErrors(*(torch.cat(field) for field in zip(*errors, strict=True)))
         for name, errors in parts.items()
     }
 
@@ -141,7 +141,7 @@ def _eval_mode(module: nn.Module) -> Iterator[None]:
 
 def pose_errors(
     T_est: Tensor, valid: Tensor, T_true: Tensor, mesh: Mesh, symmetries: Symmetries | None = None
-) -> PoseErrors:
+) -> SceneErrors:
     """Errors of poses (N, 4, 4) against true ones, on the CPU; no pose has the largest errors.
 
     ``symmetries`` are those of the object, one entry; None: it has none.
@@ -159,7 +159,9 @@ def pose_errors(
     distance = torch.where(valid, distance, torch.inf)
     matching = point_matching_error(T_est, T_true, points, symmetries, norm="l2") / diameter
     matching = torch.where(valid, matching, torch.inf).clamp(max=1.0)
-    return PoseErrors(rotation, distance, matching, (rotation < RIGHT_DEGREES) & (distance < RIGHT_DIAMETERS))
+    return SceneErrors(
+        rotation, distance, matching, (rotation < RIGHT_DEGREES) & (distance < RIGHT_DIAMETERS)
+    )
 
 
 def _nearest_truth(T_est: Tensor, T_true: Tensor, symmetries: Symmetries, points: Tensor) -> Tensor:
@@ -172,7 +174,7 @@ def _nearest_truth(T_est: Tensor, T_true: Tensor, symmetries: Symmetries, points
     return T_true @ best_symmetry(error, symmetries, angles, refine=False)
 
 
-def summarize(errors: PoseErrors) -> dict[str, float]:
+def summarize(errors: SceneErrors) -> dict[str, float]:
     """Share of right poses with its standard error, median rotation error and mean matching error with its own."""
     count = len(errors.right)
     share = float(errors.right.float().mean())
@@ -186,7 +188,7 @@ def summarize(errors: PoseErrors) -> dict[str, float]:
     }
 
 
-def compare(before: PoseErrors, after: PoseErrors) -> dict[str, float]:
+def compare(before: SceneErrors, after: SceneErrors) -> dict[str, float]:
     """Differences after minus before on the same scenes, with the standard errors of paired differences.
 
     ``gained`` and ``lost`` count the scenes whose pose became right or wrong.

@@ -26,7 +26,7 @@ from foundpose.geometry import (
 from foundpose.losses import PointMatchingLoss
 from foundpose.matching import PatchMatcher, SoftPatchMatcher
 from foundpose.onboarding import Onboarder
-from foundpose.pnp import GaussNewtonPnp, RansacPnp, SoftInlierSelection
+from foundpose.pnp import LevenbergMarquardtPnp, RansacPnp, SoftInlierSelection
 from foundpose.refinement import FeaturemetricRefiner
 from foundpose.rendering import CoordinateRenderer, RaycastRenderer
 from foundpose.rendering.coordinates import render_coordinate_image
@@ -321,7 +321,9 @@ def test_a_loss_on_the_pose_reaches_the_extractor(blob, matcher, soft_selection,
         extractor,
         retriever=TemplateRetriever(bow, num_templates=3),
         matcher=matcher,
-        pnp=RansacPnp(polish=GaussNewtonPnp(differentiation=differentiation), soft_selection=soft_selection),
+        pnp=RansacPnp(
+            polish=LevenbergMarquardtPnp(differentiation=differentiation), soft_selection=soft_selection
+        ),
     )
     e = pipeline(image, intrinsics[None], representation, masks=render.mask)
     assert e.valid.all()

@@ -6,7 +6,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from foundpose.optimization import Huber
-from foundpose.pnp import GaussNewtonPnp, PnpStatus, RansacPnp, solve_epnp
+from foundpose.pnp import LevenbergMarquardtPnp, PnpStatus, RansacPnp, solve_epnp
 from foundpose.pnp.sampling import distinct_ranks
 from tests.pnp.scenes import Scene, make_scene, pose_errors, stack
 
@@ -261,7 +261,8 @@ def test_robust_polish_resists_outliers_within_the_threshold() -> None:
     inputs = stack(scenes, torch.float64)
     plain = pose_errors(RansacPnp()(*inputs).T_camera_from_model, scenes)[0]
     robust = pose_errors(
-        RansacPnp(polish=GaussNewtonPnp(Huber(0.5), max_iterations=10))(*inputs).T_camera_from_model, scenes
+        RansacPnp(polish=LevenbergMarquardtPnp(Huber(0.5), max_iterations=10))(*inputs).T_camera_from_model,
+        scenes,
     )[0]
     assert np.median(robust) < 0.6 * np.median(plain)
 

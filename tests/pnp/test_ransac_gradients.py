@@ -5,7 +5,7 @@ from torch import Tensor
 
 from foundpose.geometry.transforms import make_transform
 from foundpose.optimization import BarronLoss
-from foundpose.pnp import GaussNewtonPnp, RansacPnp, SoftInlierSelection
+from foundpose.pnp import LevenbergMarquardtPnp, RansacPnp, SoftInlierSelection
 from foundpose.pnp.soft_selection import choose_softly
 from tests.pnp.scenes import make_scene, stack
 
@@ -30,8 +30,8 @@ def problems(
     return image, model, K, weights, wrong
 
 
-def precise(mode: str = "implicit", loss=None) -> GaussNewtonPnp:
-    return GaussNewtonPnp(loss, max_iterations=80, tolerance=0.0, differentiation=mode)
+def precise(mode: str = "implicit", loss=None) -> LevenbergMarquardtPnp:
+    return LevenbergMarquardtPnp(loss, max_iterations=80, tolerance=0.0, differentiation=mode)
 
 
 def scaled(T: Tensor) -> Tensor:
@@ -146,7 +146,7 @@ def test_gradients_are_finite_at_hard_cases(case: str, mode: str, solver: str, d
         solver,
         min_inliers=4,
         threshold=5.0,
-        polish=GaussNewtonPnp(differentiation=mode),
+        polish=LevenbergMarquardtPnp(differentiation=mode),
         soft_selection=SoftInlierSelection(8),
     )
     result = ransac(*inputs, valid)

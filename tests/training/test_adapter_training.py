@@ -10,7 +10,7 @@ from foundpose.geometry import rotation_angle, stack_symmetries, symmetries_from
 from foundpose.losses import GeodesicRotationLoss, PointMatchingLoss, ProjectionLoss
 from foundpose.matching import SoftPatchMatcher
 from foundpose.optimization import BarronLoss
-from foundpose.pnp import GaussNewtonPnp, RansacPnp
+from foundpose.pnp import LevenbergMarquardtPnp, RansacPnp
 from foundpose.synthetic import LightVariation, procedural_mesh
 from foundpose.training import (
     AdapterTraining,
@@ -25,7 +25,7 @@ logging.getLogger("pytorch_lightning").setLevel(logging.ERROR)
 
 
 def new_training(pnp="gauss_newton", alpha=1.0, scale=30.0, iterations=30, tolerance=1e-5, **settings):
-    polish = GaussNewtonPnp(BarronLoss(alpha, scale), max_iterations=iterations, tolerance=tolerance)
+    polish = LevenbergMarquardtPnp(BarronLoss(alpha, scale), max_iterations=iterations, tolerance=tolerance)
     return AdapterTraining(
         ResidualAdapter(256, 32),
         SoftPatchMatcher(0.15, learnable=True),
@@ -187,7 +187,7 @@ def test_training_improves_the_poses_of_unseen_objects(sift_onboarder, crop, tmp
     training = AdapterTraining(
         ResidualAdapter(256, 128),
         SoftPatchMatcher(0.1, learnable=True),
-        GaussNewtonPnp(max_iterations=30, tolerance=1e-4),
+        LevenbergMarquardtPnp(max_iterations=30, tolerance=1e-4),
         error_scale=0.1,
     )
     ransac = RansacPnp()

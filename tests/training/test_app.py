@@ -15,7 +15,7 @@ import foundpose.training
 from foundpose.config import build_method
 from foundpose.features import AdaptedExtractor, ResidualAdapter
 from foundpose.optimization import BarronLoss, LeastSquares
-from foundpose.pnp import GaussNewtonPnp, RansacPnp
+from foundpose.pnp import LevenbergMarquardtPnp, RansacPnp
 from tests.bop_dataset import write_ply
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -79,7 +79,7 @@ def test_every_loss_is_a_choice(option):
 
 def test_pnp_robust_loss_and_temperature_are_choices():
     training = new_training()
-    assert type(training.pnp) is GaussNewtonPnp
+    assert type(training.pnp) is LevenbergMarquardtPnp
     assert type(training.pnp.loss) is LeastSquares
     assert type(new_training("robust_loss=barron").pnp.loss) is BarronLoss
     training = new_training("training.pnp=${pnp}", "pnp.iterations=77", "robust_loss=barron")

@@ -9,7 +9,7 @@ from foundpose.matching import PatchMatcher
 from foundpose.pipeline import FoundPose, MatchAndSolve
 from foundpose.pnp import RansacPnp
 from foundpose.retrieval import QueryPatches, TemplateRetriever
-from foundpose.training import PoseErrors, compare, evaluate_scenes, summarize
+from foundpose.training import SceneErrors, compare, evaluate_scenes, summarize
 from foundpose.training.evaluation import GivenTemplates, pose_errors
 
 
@@ -73,7 +73,7 @@ def test_pose_errors_of_symmetric_objects(bodies):
 
 def errors_of(rotation, matching):
     rotation = torch.tensor(rotation)
-    return PoseErrors(rotation, torch.zeros(len(rotation)), torch.tensor(matching), rotation < 10)
+    return SceneErrors(rotation, torch.zeros(len(rotation)), torch.tensor(matching), rotation < 10)
 
 
 def test_summary_and_paired_comparison():

@@ -10,7 +10,7 @@ from torch import Tensor
 from foundpose.geometry.cameras import project_points
 from foundpose.geometry.transforms import make_transform, rotation_angle, se3_exp, transform_points
 from foundpose.optimization import BarronLoss, Huber
-from foundpose.pnp import GaussNewtonPnp
+from foundpose.pnp import LevenbergMarquardtPnp
 from tests.pnp.scenes import make_scene, stack
 
 LOSSES = {"least_squares": None, "huber": Huber(3.0), "barron": BarronLoss(0.0, 5.0).double()}
@@ -42,7 +42,7 @@ def perturb(T: Tensor, twist: Tensor) -> Tensor:
 @pytest.mark.parametrize("loss", LOSSES)
 def test_reaches_scipys_optimum(loss: str) -> None:
     image, model, K, weights, T0 = problems(4, 30, noise=2.0)
-    optimum = GaussNewtonPnp(LOSSES[loss], max_iterations=100)(T0, image, model, K, weights)
+    optimum = LevenbergMarquardtPnp(LOSSES[loss], max_iterations=100)(T0, image, model, K, weights)
     assert optimum.converged.all()
     assert (optimum.cost <= optimum.initial_cost).all()
     scale = {"huber": 3.0, "barron": 5.0, "least_squares": 1.0}[loss]
@@ -71,7 +71,7 @@ def test_reaches_scipys_optimum(loss: str) -> None:
 
 
 def pose_function(mode: str, loss, T0: Tensor):
-    module = GaussNewtonPnp(loss, max_iterations=150, tolerance=0.0, differentiation=mode)
+    module = LevenbergMarquardtPnp(loss, max_iterations=150, tolerance=0.0, differentiation=mode)
 
     def run(image: Tensor, model: Tensor, K: Tensor, weights: Tensor) -> Tensor:
         T = module(T0, image, model, K, weights).T_camera_from_model
@@ -111,7 +111,7 @@ def test_unrolled_gradient_of_the_start() -> None:
     image, model, K, weights, T0 = problems(1, 8, noise=2.0)
 
     def run(twist: Tensor, mode: str = "unrolled") -> Tensor:
-        module = GaussNewtonPnp(max_iterations=2, tolerance=0.0, differentiation=mode)
+        module = LevenbergMarquardtPnp(max_iterations=2, tolerance=0.0, differentiation=mode)
         return module(se3_exp(twist) @ T0, image, model, K, weights).T_camera_from_model[:, :3]
 
     twist = torch.zeros(1, 6, dtype=torch.float64, requires_grad=True)
@@ -131,9 +131,9 @@ def test_gradient_of_the_loss_parameters() -> None:
     loss = BarronLoss(-1.0, 2.0, learnable=True).double()
 
     def rotation() -> Tensor:
-        return GaussNewtonPnp(loss, 300, tolerance=0.0)(T0, image, model, K, weights).T_camera_from_model[
-            0, 0, 1
-        ]
+        return LevenbergMarquardtPnp(loss, 300, tolerance=0.0)(
+            T0, image, model, K, weights
+        ).T_camera_from_model[0, 0, 1]
 
     gradient = torch.autograd.grad(rotation(), list(loss.parameters()))
     for parameter, slope in zip(loss.parameters(), gradient, strict=True):
@@ -153,7 +153,7 @@ def test_covariance_against_monte_carlo(noise: float | None) -> None:
     scene = make_scene(np.random.default_rng(3), 12, "volume", True)
     T = make_transform(torch.from_numpy(scene.R), torch.from_numpy(scene.t))[None]
     draws = torch.randn(trials, 12, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    module = GaussNewtonPnp(noise=noise)
+    module = LevenbergMarquardtPnp(noise=noise)
     with torch.no_grad():
         optimum = module(
             T.expand(trials, 4, 4),
@@ -178,12 +178,12 @@ def test_covariance_against_monte_carlo(noise: float | None) -> None:
 def test_covariance_scales_with_weights_and_says_when_there_is_none() -> None:
     image, model, K, _, T0 = problems(1, 12, noise=1.0)
     weights = torch.ones(1, 12, dtype=torch.float64)
-    known = GaussNewtonPnp(noise=1.0)
+    known = LevenbergMarquardtPnp(noise=1.0)
     once = known(T0, image, model, K, weights).covariance
     torch.testing.assert_close(
         known(T0, image, model, K, 4 * weights).covariance, once / 4, rtol=1e-6, atol=0
     )
-    estimated = GaussNewtonPnp()
+    estimated = LevenbergMarquardtPnp()
     a, b = (estimated(T0, image, model, K, s * weights).covariance for s in (1, 4))
     torch.testing.assert_close(a, b, rtol=1e-6, atol=0)
     # Three points determine the pose but leave nothing to estimate the noise from; two do not even do that.
@@ -198,9 +198,9 @@ def test_covariance_of_a_robust_loss_counts_the_outliers_out() -> None:
     image, model, K, _, T0 = problems(1, 40, noise=1.0, seed=2)
     spoilt = image.clone()
     spoilt[:, :8] += 200.0
-    clean = GaussNewtonPnp()(T0, image, model, K).covariance.diagonal(dim1=1, dim2=2).sqrt()
-    robust = GaussNewtonPnp(BarronLoss(-5.0, 3.0).double(), 100)(T0, spoilt, model, K)
-    plain = GaussNewtonPnp(max_iterations=100)(T0, spoilt, model, K)
+    clean = LevenbergMarquardtPnp()(T0, image, model, K).covariance.diagonal(dim1=1, dim2=2).sqrt()
+    robust = LevenbergMarquardtPnp(BarronLoss(-5.0, 3.0).double(), 100)(T0, spoilt, model, K)
+    plain = LevenbergMarquardtPnp(max_iterations=100)(T0, spoilt, model, K)
     assert (robust.covariance.diagonal(dim1=1, dim2=2).sqrt() / clean < 2.0).all()
     assert (plain.covariance.diagonal(dim1=1, dim2=2).sqrt() / clean > 5.0).all()
 
@@ -243,7 +243,7 @@ def test_gradients_are_finite_at_hard_cases(case: str, mode: str, dtype: torch.d
     if case == "nan_pose":
         start[:] = math.nan
     inputs = [x.to(dtype).requires_grad_() for x in (image, model, K, weights)]
-    module = GaussNewtonPnp(differentiation=mode)
+    module = LevenbergMarquardtPnp(differentiation=mode)
     optimum = module(start.to(dtype), *inputs)
     angle = optimum.T_camera_from_model[:, :3].square().sum()
     gradients = torch.autograd.grad(angle, inputs, allow_unused=True)
@@ -262,7 +262,7 @@ def test_gradients_are_finite_at_hard_cases(case: str, mode: str, dtype: torch.d
 def pose_gradient(T: Tensor, inputs: list[Tensor]) -> Tensor:
     """The gradient with respect to the image points by unrolling many iterations in float64."""
     image = inputs[0].requires_grad_()
-    module = GaussNewtonPnp(max_iterations=50, tolerance=0.0, differentiation="unrolled")
+    module = LevenbergMarquardtPnp(max_iterations=50, tolerance=0.0, differentiation="unrolled")
     # Steps have to be taken: an exact fit would stay where it is.
     twist = torch.tensor([[3.0, -2.0, 4.0, 0.03, -0.02, 0.01]], dtype=torch.float64)
     T = module(perturb(T, twist), image, *inputs[1:]).T_camera_from_model
@@ -273,11 +273,11 @@ def test_gradients_do_not_depend_on_the_batch() -> None:
     image, model, K, weights, T0 = problems(5, 15, noise=3.0, seed=4)
     weights[2] = 0.0  # a hopeless neighbour
     leaves = [x.clone().requires_grad_() for x in (image, model, K, weights)]
-    T = GaussNewtonPnp()(T0, *leaves).T_camera_from_model
+    T = LevenbergMarquardtPnp()(T0, *leaves).T_camera_from_model
     together = torch.autograd.grad(T[:, :3].square().sum(), leaves)
     for b in range(5):
         alone_leaves = [x[b : b + 1].clone().requires_grad_() for x in (image, model, K, weights)]
-        alone_T = GaussNewtonPnp()(T0[b : b + 1], *alone_leaves).T_camera_from_model
+        alone_T = LevenbergMarquardtPnp()(T0[b : b + 1], *alone_leaves).T_camera_from_model
         assert torch.equal(alone_T[0], T[b])
         alone = torch.autograd.grad(alone_T[:, :3].square().sum(), alone_leaves, allow_unused=True)
         for one, many in zip(alone, together, strict=True):
@@ -305,7 +305,7 @@ def test_hopeless_neighbours_disturb_nobody(case: str, mode: str, dtype: torch.d
         T0[bad] = make_transform(torch.eye(3, dtype=torch.float64).expand(60, 3, 3), 300 * T0[bad, :3, 3])
         image[bad] = project_points(transform_points(T0[bad], model[bad]), K[bad])[0] + 0.1 * image[bad].sin()
     T0, image, model, K, weights = (x.to(dtype) for x in (T0, image, model, K, weights))
-    module = GaussNewtonPnp(max_iterations=30, differentiation=mode)
+    module = LevenbergMarquardtPnp(max_iterations=30, differentiation=mode)
 
     def gradients(rows: slice) -> list[Tensor]:
         count = len(T0[rows])
@@ -337,7 +337,7 @@ def test_hopeless_neighbours_disturb_nobody(case: str, mode: str, dtype: torch.d
 def test_a_failed_pose_has_no_covariance() -> None:
     image, model, K, weights, T0 = problems(2, 10)
     T0[1, 2, 3] = -T0[1, 2, 3]
-    optimum = GaussNewtonPnp(noise=1.0)(T0, image.requires_grad_(), model, K, weights)
+    optimum = LevenbergMarquardtPnp(noise=1.0)(T0, image.requires_grad_(), model, K, weights)
     assert optimum.failed.tolist() == [False, True]
     assert optimum.regular.tolist() == [True, False]
     assert torch.isinf(optimum.covariance[1].diagonal()).all()
@@ -347,14 +347,14 @@ def test_a_failed_pose_has_no_covariance() -> None:
 def test_padding_has_no_influence() -> None:
     image, model, K, weights, T0 = problems(2, 10, noise=2.0)
     garbage = torch.full((2, 4, 3), 1e3, dtype=torch.float64)
-    padded = GaussNewtonPnp()(
+    padded = LevenbergMarquardtPnp()(
         T0,
         torch.cat([image, garbage[..., :2]], 1),
         torch.cat([model, garbage], 1),
         K,
         torch.cat([weights, torch.zeros(2, 4, dtype=torch.float64)], 1),
     )
-    plain = GaussNewtonPnp()(T0, image, model, K, weights)
+    plain = LevenbergMarquardtPnp()(T0, image, model, K, weights)
     torch.testing.assert_close(padded.T_camera_from_model, plain.T_camera_from_model, rtol=1e-9, atol=1e-7)
     torch.testing.assert_close(padded.covariance, plain.covariance, rtol=1e-5, atol=0)
 
@@ -362,8 +362,8 @@ def test_padding_has_no_influence() -> None:
 def test_the_same_with_and_without_gradient() -> None:
     image, model, K, weights, T0 = (x.float() for x in problems(3, 10, noise=2.0))
     with torch.no_grad():
-        plain = GaussNewtonPnp()(T0, image, model, K, weights)
-    graph = GaussNewtonPnp()(T0, image.requires_grad_(), model, K, weights)
+        plain = LevenbergMarquardtPnp()(T0, image, model, K, weights)
+    graph = LevenbergMarquardtPnp()(T0, image.requires_grad_(), model, K, weights)
     assert torch.equal(plain.T_camera_from_model, graph.T_camera_from_model)
     assert torch.equal(plain.covariance, graph.covariance)
     assert not graph.covariance.requires_grad
@@ -381,7 +381,7 @@ def saved_bytes(mode: str, iterations: int) -> int:
         return x
 
     kept: list[Tensor] = []
-    module = GaussNewtonPnp(max_iterations=iterations, tolerance=0.0, differentiation=mode)
+    module = LevenbergMarquardtPnp(max_iterations=iterations, tolerance=0.0, differentiation=mode)
     with torch.autograd.graph.saved_tensors_hooks(pack, lambda x: x):
         optimum = module(T0, image.requires_grad_(), model, K, weights)
     assert optimum.iterations.max() >= min(iterations, 15)
@@ -405,7 +405,7 @@ def test_bad_arguments() -> None:
         ({"differentiation": "finite"}, "'implicit' or 'unrolled', got 'finite'"),
     ]:
         with pytest.raises(ValueError, match=message):
-            GaussNewtonPnp(**arguments)
+            LevenbergMarquardtPnp(**arguments)
     image, model, K, weights, T0 = problems(2, 10)
     with pytest.raises(ValueError, match=r"weights must have shape \(2, 10\), got \(2, 9\)"):
-        GaussNewtonPnp()(T0, image, model, K, weights[:, :9])
+        LevenbergMarquardtPnp()(T0, image, model, K, weights[:, :9])

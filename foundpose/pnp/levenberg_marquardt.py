@@ -40,7 +40,7 @@ class PnpOptimum(NamedTuple):
     regular: Tensor
 
 
-class GaussNewtonPnp(nn.Module):
+class LevenbergMarquardtPnp(nn.Module):
     """Weighted, robust PnP from an initial pose, by batched Levenberg-Marquardt on Gauss-Newton systems.
 
     Each sample has its own damping, acceptance and convergence. The gradient is by default that of the optimum
