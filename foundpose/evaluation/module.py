@@ -100,7 +100,8 @@ class PoseEvaluation(pl.LightningModule):
 
     def _stages(self) -> dict[str, nn.Module]:
         stages = dict(self.pipeline.named_children())
-        return stages | dict(self.pipeline.hypotheses.named_children())
+        # By its parts, so that stages take no time twice.
+        return dict(stages.pop("hypotheses").named_children()) | stages
 
 
 def estimate_dataset(trainer: pl.Trainer, module: PoseEvaluation, data: PoseDataModule) -> None:

@@ -82,7 +82,7 @@ def test_poses_of_a_dataset(root, store, tmp_path, order):
         assert first["time"] == second["time"]
         assert first["time"] == pytest.approx(0.25 + first["seconds"] + second["seconds"])
     facts = timing(done, "cpu")
-    stages = {"crop", "extractor", "retriever", "matcher", "pnp", "other"}
+    stages = {"crop", "extractor", "retriever", "matcher", "pnp", "scorer", "other"}
     assert set(facts["seconds"]) == stages | {"pipeline", "waiting", "representations"}
     assert sum(facts["seconds"][name] for name in stages) == pytest.approx(facts["seconds"]["pipeline"])
     assert facts["seconds"]["pipeline"] == pytest.approx(sum(r["seconds"] for r in records))
