@@ -1,5 +1,6 @@
 """Tasks of onboarding: its stages on objects of the workload's size."""
 
+import copy
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -47,6 +48,11 @@ class OnboardingJob(NamedTuple):
     described: int
     folder: Path
     free: Onboarder | None = None
+
+
+def projected_descriptors(workload: Workload) -> Tensor:
+    """The templates' descriptors (M, d), projected in single precision; the workload stays as precise as it is."""
+    return copy.deepcopy(workload.representation.projection).float()(raw_descriptors(workload))
 
 
 def raw_descriptors(workload: Workload) -> Tensor:

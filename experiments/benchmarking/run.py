@@ -24,7 +24,7 @@ from benchmarking.inference import (
     stage_tasks,
 )
 from benchmarking.measure import MeasureSettings
-from benchmarking.onboarding import OnboardingJob, onboarding_tasks, raw_descriptors
+from benchmarking.onboarding import OnboardingJob, onboarding_tasks, projected_descriptors
 from benchmarking.references import inference_references, kmeans_reference, run_references
 from benchmarking.report import BenchmarkResult
 from benchmarking.sizes import WorkloadSizes
@@ -87,8 +87,7 @@ def run_benchmark(cfg: DictConfig, folder: Path, progress: Progress) -> Benchmar
     if "references" in cfg.groups:
         references = inference_references(stages, workload)
         if cfg.references.kmeans:
-            projection = copy.deepcopy(workload.representation.projection).float()
-            descriptors = projection(raw_descriptors(workload))
+            descriptors = projected_descriptors(workload)
             references.append(
                 kmeans_reference(descriptors, method.onboarder.words, cfg.references.kmeans_iterations)
             )

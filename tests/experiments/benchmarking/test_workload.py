@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from benchmarking import ScriptedExtractor, WorkloadSizes, make_workload, subset, with_crops
-from benchmarking.onboarding import raw_descriptors
+from benchmarking.onboarding import projected_descriptors, raw_descriptors
 from benchmarking.workload import SEMI_AXES, ellipsoid_mesh
 from foundpose.geometry import PerspectiveCrop, project_points, rotation_angle, transform_points
 from foundpose.pipeline import select_query_patches
@@ -188,3 +188,13 @@ def test_same_workload_on_a_gpu(workload):
     other = make_workload(SIZES, "cuda")
     assert torch.allclose(workload.features, other.features.cpu(), atol=1e-3)
     assert torch.equal(workload.representation.template_offsets, other.representation.template_offsets.cpu())
+
+
+def test_descriptors_for_clustering_leave_double_precision_alone() -> None:
+    workload = make_workload(SIZES).to(torch.float64)
+    before = workload.representation.projection.components.clone()
+    descriptors = projected_descriptors(workload)
+    assert descriptors.dtype == torch.float32
+    after = workload.representation.projection.components
+    assert after.dtype == torch.float64
+    assert torch.equal(before, after)
