@@ -24,7 +24,7 @@ from benchmarking.inference import (
     stage_tasks,
 )
 from benchmarking.measure import MeasureSettings
-from benchmarking.onboarding import OnboardingJob, onboarding_tasks, projected_descriptors
+from benchmarking.onboarding import OnboardingJob, onboarding_tasks, projected_descriptors, raw_descriptors
 from benchmarking.references import inference_references, kmeans_reference, run_references
 from benchmarking.report import BenchmarkResult
 from benchmarking.sizes import WorkloadSizes
