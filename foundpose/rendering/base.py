@@ -1,6 +1,6 @@
 """The renderer interface, and what every renderer does the same way."""
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections import OrderedDict
 from collections.abc import Callable
 from typing import Any, Generic, NamedTuple, TypeVar
@@ -94,7 +94,7 @@ class MeshCache(Generic[_T]):
         return self._entries[mesh.checksum]
 
 
-class Renderer(Configured, ABC):
+class Renderer(Configured):
     """Renders a mesh from a batch of cameras; subclasses decide which face each sample sees.
 
     The light is fixed to the camera: ``ambient`` from everywhere, the rest along the optical axis, on both

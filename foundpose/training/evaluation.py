@@ -16,7 +16,7 @@ from foundpose.onboarding import Progress
 from foundpose.pipeline import FoundPose
 from foundpose.rendering import Mesh, Renderer
 from foundpose.representation import ObjectRepresentation
-from foundpose.retrieval import QueryPatches, RetrievedTemplates
+from foundpose.retrieval import QueryPatches, RetrievedTemplates, Retriever
 from foundpose.synthetic import LightVariation, cluttered_scene
 
 RIGHT_DEGREES = 10.0
@@ -40,8 +40,8 @@ class SceneErrors(NamedTuple):
     right: Tensor
 
 
-class GivenTemplates(nn.Module):
-    """Takes a retriever's place and returns the templates that it was told to.
+class GivenTemplates(Retriever):
+    """Returns the templates that it was told to.
 
     Attributes:
         index: (B, h) templates of the next batch of crops.
@@ -95,7 +95,7 @@ def evaluate_scenes(
         told = FoundPose(
             pipeline.crop,
             pipeline.extractor,
-            given,  # type: ignore[arg-type]  # it stands in for a retriever
+            given,
             pipeline.hypotheses,
             pipeline.refiner,
             pipeline.refine,

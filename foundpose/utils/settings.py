@@ -1,16 +1,18 @@
 """What modules say of their settings: what files on disk are named after."""
 
+from abc import ABC, abstractmethod
+
 from torch import nn
 
 Setting = str | int | float | bool | None
 
 
-class Configured(nn.Module):
+class Configured(nn.Module, ABC):
     """A module that says all settings which its results depend on."""
 
+    @abstractmethod
     def settings(self) -> dict[str, Setting]:
         """Settings by name."""
-        raise NotImplementedError(f"{type(self).__name__} must define settings()")
 
     def extra_repr(self) -> str:
         """Settings, for printing."""

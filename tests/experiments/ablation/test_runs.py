@@ -1,5 +1,6 @@
 import csv
 import json
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -191,3 +192,11 @@ def test_a_single_run_of_an_experiment(root, tmp_path, monkeypatch, capsys):
     assert record.figures["AR_MSPD"] > 0.9
     assert "1 runs finished, 0 failed" in capsys.readouterr().out
     assert json.loads((record.folder / "scores.json").read_text())["targets"] == 3
+
+
+def test_workers_of_a_launcher_find_what_lies_beside_the_app(monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", "elsewhere")
+    runpy.run_path(str(ROOT / "experiments" / "ablate.py"), run_name="ablate")
+    worker = [sys.executable, "-c", "import ablation, os; print(os.environ['PYTHONPATH'])"]
+    told = subprocess.run(worker, capture_output=True, text=True, check=True, cwd=ROOT / "tests").stdout
+    assert told.strip().endswith("elsewhere")
