@@ -1,5 +1,6 @@
 """6D pose of unseen objects from one RGB image: FoundPose (ECCV 2024) as differentiable, batched modules."""
 
+from foundpose.config import load
 from foundpose.features import DenseSift, DinoV2, FeatureHook, PatchExtractor, PcaProjection
 from foundpose.geometry import PerspectiveCrop, SphereInplane, SuperFibonacci
 from foundpose.matching import PatchMatcher, SoftPatchMatcher
@@ -73,5 +74,6 @@ __all__ = [
     "TemplateStart",
     "TopTemplatePose",
     "VisualWords",
+    "load",
     "load_mesh",
 ]

@@ -6,12 +6,13 @@ import os
 import sys
 import sysconfig
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from hydra import compose, initialize_config_dir
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
@@ -53,6 +54,28 @@ class Method(NamedTuple):
     onboarder: Onboarder
     pipeline: FoundPose
     store: RepresentationStore
+
+
+def apps_folder() -> Path:
+    """Where ``conf/`` and ``experiments/`` lie: ``foundpose/apps`` of an installed wheel, or the checkout."""
+    packaged = Path(__file__).resolve().parent / "apps"
+    return packaged if packaged.is_dir() else Path(__file__).resolve().parents[1]
+
+
+def load_config(name: str = "config", overrides: Sequence[str] = ()) -> DictConfig:
+    """A configuration of ``conf/`` without Hydra's command line.
+
+    Args:
+        name: a file of ``conf/``; ``"config"`` is the method with its default settings.
+        overrides: as on the command line, e.g. ``["extractor=dense_sift", "refiner=featuremetric"]``.
+    """
+    with initialize_config_dir(str(apps_folder() / "conf"), version_base="1.3"):
+        return compose(name, list(overrides))
+
+
+def load(name: str = "config", overrides: Sequence[str] = ()) -> Method:
+    """Onboarder, pipeline and store of a configuration; arguments as in :func:`load_config`."""
+    return build_method(load_config(name, overrides))
 
 
 def build_method(cfg: DictConfig) -> Method:
