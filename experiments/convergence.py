@@ -19,14 +19,14 @@ from tqdm import tqdm
 
 from foundpose.bop import BopDataset, Instance, ground_truth_instances
 from foundpose.config import build_method, clear_errors, wanted_objects
-from foundpose.geometry import make_transform, project_to_rotation
-from foundpose.refinement import PoseProposals, RefinedPoses
-from foundpose.refinement.convergence import (
+from foundpose.geometry import (
     PoseDeviation,
-    nearest_templates,
+    make_transform,
     perturbed_poses,
     pose_deviation,
+    project_to_rotation,
 )
+from foundpose.refinement import PoseProposals, RefinedPoses
 from foundpose.rendering import load_mesh
 from foundpose.utils.files import write_atomically
 from foundpose.utils.progress import ProgressBars
@@ -75,12 +75,12 @@ def run(cfg: DictConfig, output: Path) -> None:
             degrees * cfg.translation_per_degree * diameter,
             generator,
         )
-        template = nearest_templates(T_crop[None], representation.T_template_from_model.cpu())
+        template = representation.nearest_views(T_crop[None].to(K))
         proposals = PoseProposals(
             T_crop_from_model=starts[None].to(K),
             score=torch.zeros(1, len(degrees)).to(K),
             valid=torch.ones(1, len(degrees), dtype=torch.bool, device=K.device),
-            template_index=template.expand(1, len(degrees)).to(K.device),
+            template_index=template.expand(1, len(degrees)),
             crops=estimates.crops,
             features=features,
             grid=method.pipeline.extractor.patch_grid(method.pipeline.crop.size),

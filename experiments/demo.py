@@ -15,7 +15,7 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from foundpose.config import Method, build_method, clear_errors
-from foundpose.geometry import rotation_angle
+from foundpose.geometry import pose_deviation
 from foundpose.pipeline.results import PoseEstimates
 from foundpose.representation import ObjectRepresentation
 from foundpose.utils.progress import ProgressBars
@@ -101,9 +101,8 @@ def judge(cfg: DictConfig, scene: KnownScene, estimates: PoseEstimates, figure: 
 
 def errors(T_camera_from_model: Tensor, scene: KnownScene) -> tuple[float, float]:
     """Rotation error in degrees and translation error in the mesh's unit."""
-    T, truth = T_camera_from_model.cpu(), scene.T_camera_from_model
-    rotation = float(torch.rad2deg(rotation_angle(T[:3, :3], truth[:3, :3])))
-    return rotation, float((T[:3, 3] - truth[:3, 3]).norm())
+    deviation = pose_deviation(T_camera_from_model.cpu(), scene.T_camera_from_model)
+    return float(deviation.rotation), float(deviation.translation)
 
 
 def say(step: str) -> None:

@@ -21,15 +21,17 @@ from omegaconf import DictConfig, OmegaConf
 from pytorch_lightning.callbacks import ModelCheckpoint
 from pytorch_lightning.loggers import CSVLogger
 from safetensors.torch import load_file, save_file
+from tqdm import tqdm
 
 from foundpose.config import build_method, claim_run_folder, clear_errors
 from foundpose.features import ResidualAdapter
 from foundpose.geometry import Symmetries, stack_symmetries, symmetries_from_models_info
 from foundpose.rendering import Mesh, load_mesh
+from foundpose.synthetic import cluttered_scene
 from foundpose.training import (
     AdapterTraining,
     PairDataModule,
-    SceneErrors,
+    PoseErrors,
     compare,
     evaluate_scenes,
     summarize,
@@ -174,25 +176,25 @@ def write_extractor(cfg: DictConfig, path: Path) -> None:
 
 def measure(
     cfg: DictConfig, mesh: Mesh, symmetries: Symmetries | None, kept: Path, title: str
-) -> dict[str, SceneErrors]:
+) -> dict[str, PoseErrors]:
     """Onboard the held-out object and estimate its pose in all scenes, or read the errors that were kept."""
     if kept.is_file():
         tensors = load_file(kept)
         return {
-            mode: SceneErrors(*(tensors[f"{mode}.{field}"] for field in SceneErrors._fields))
-            for mode in MODES
+            mode: PoseErrors(*(tensors[f"{mode}.{field}"] for field in PoseErrors._fields)) for mode in MODES
         }
     method = build_method(cfg)
     representation = method.store.get(mesh, "held-out", ProgressBars(title)).to(cfg.device)
+    light, renderer = instantiate(cfg.light), method.onboarder.renderer
+    scenes = (
+        cluttered_scene(mesh, seed, occlusion=cfg.pairs.occlusion, renderer=renderer, light=light)
+        for seed in range(HELD_OUT_SCENES, HELD_OUT_SCENES + cfg.scenes)
+    )
     errors = evaluate_scenes(
         method.pipeline,
         representation,
         mesh,
-        [HELD_OUT_SCENES + k for k in range(cfg.scenes)],
-        method.onboarder.renderer,
-        instantiate(cfg.light),
-        cfg.pairs.occlusion,
-        progress=ProgressBars(title),
+        tqdm(scenes, f"{title} scenes", cfg.scenes),
         symmetries=symmetries,
     )
     flat = {f"{mode}.{field}": value for mode in MODES for field, value in errors[mode]._asdict().items()}
@@ -241,14 +243,14 @@ def print_table(results: dict[str, dict[str, Any]]) -> None:
         for stage in ("before", "after"):
             row = rows[stage]
             print(
-                f"{mode:<11}{stage:<8}{row['right']:>7.1%}{row['median_rotation_degrees']:>16.2f}°"
-                f"{row['mean_matching_error']:>27.3f}"
+                f"{mode:<11}{stage:<8}{row['right']:>7.1%}{row['median_rotation']:>16.2f}°"
+                f"{row['mean_matching']:>27.3f}"
             )
         change = rows["change"]
         print(
             f"{mode:<11}{'change':<8}{change['right']:>+7.1%} ± {change['right_standard_error']:.1%}, "
             f"{change['gained']} poses gained, {change['lost']} lost; matching error "
-            f"{change['mean_matching_error']:+.3f} ± {change['matching_standard_error']:.3f}"
+            f"{change['mean_matching']:+.3f} ± {change['mean_matching_standard_error']:.3f}"
         )
 
 

@@ -28,9 +28,9 @@ from foundpose.training import (
     RefinerPictures,
     RefinerTraining,
     RendererPerMesh,
-    compare_refinement,
+    compare,
     evaluate_refiner,
-    summarize_refinement,
+    summarize,
 )
 from foundpose.training.meshes import meshes_to_train_on, small_mesh
 from foundpose.utils.files import write_atomically
@@ -71,9 +71,9 @@ def run(cfg: DictConfig, output: Path) -> None:
     before, after = timed(seconds, "measuring", lambda: measure(cfg, refiner.eval(), held_out))
 
     results = {
-        "before": summarize_refinement(before),
-        "after": summarize_refinement(after),
-        "change": compare_refinement(before, after),
+        "before": summarize(before),
+        "after": summarize(after),
+        "change": compare(before, after),
     }
     facts = {"results": results, "seconds": seconds, "settings": OmegaConf.to_container(cfg, resolve=True)}
     write_atomically(

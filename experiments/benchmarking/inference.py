@@ -11,7 +11,7 @@ from benchmarking.scripted import ScriptedExtractor
 from benchmarking.tasks import Task
 from benchmarking.workload import Workload, ellipsoid_mesh
 from foundpose.features import PatchExtractor
-from foundpose.geometry import PerspectiveCrop, rotation_angle
+from foundpose.geometry import PerspectiveCrop, pose_deviation
 from foundpose.matching import PatchMatcher, SoftPatchMatcher
 from foundpose.pipeline import (
     FoundPose,
@@ -89,15 +89,14 @@ def estimate(pipeline: FoundPose, workload: Workload) -> PoseEstimates:
 
 def accuracy(estimates: PoseEstimates, workload: Workload) -> dict[str, float]:
     """Share of crops whose pose is found (within 5 degrees and 5 % of the distance), and median errors."""
-    truth, found = workload.T_camera_from_model, estimates.T_camera_from_model
-    degrees = torch.rad2deg(rotation_angle(found[:, :3, :3], truth[:, :3, :3]))
-    distance = torch.linalg.vector_norm(found[:, :3, 3] - truth[:, :3, 3], dim=1)
-    distance = distance / torch.linalg.vector_norm(truth[:, :3, 3], dim=1)
-    ok = estimates.valid & (degrees < 5.0) & (distance < 0.05)
+    truth = workload.T_camera_from_model
+    away = torch.linalg.vector_norm(truth[:, :3, 3], dim=1)
+    deviation = pose_deviation(estimates.T_camera_from_model, truth, unit=away)
+    ok = estimates.valid & (deviation.rotation < 5.0) & (deviation.translation < 0.05)
     return {
         "poses_found": float(ok.float().mean()),
-        "median_degrees": float(degrees.median()),
-        "median_distance_share": float(distance.median()),
+        "median_degrees": float(deviation.rotation.median()),
+        "median_distance_share": float(deviation.translation.median()),
     }
 
 

@@ -17,7 +17,7 @@ from benchmarking.inference import Stages, pnp_name, stage_inputs
 from benchmarking.measure import MeasureSettings, measure
 from benchmarking.numpy_method import match_by_template, retrieve_by_template
 from benchmarking.workload import Workload
-from foundpose.geometry import rotation_angle
+from foundpose.geometry import pose_deviation
 from foundpose.onboarding import Progress
 from foundpose.pnp import LevenbergMarquardtPnp, RansacPnp
 from foundpose.refinement import FeaturemetricRefiner
@@ -306,10 +306,8 @@ def _same_indices(name: str, valid: Tensor | None = None) -> Callable[[Tensor, A
 def _pose_agreement(ours: Tensor, theirs: Tensor) -> dict[str, float]:
     """Turn between two poses in degrees, and their distance as a share of the distance from the camera."""
     a, b = ours.double().cpu(), theirs.double().cpu()
-    return {
-        "degrees_apart": float(torch.rad2deg(rotation_angle(a[:3, :3], b[:3, :3]))),
-        "distance_apart": float((a[:3, 3] - b[:3, 3]).norm() / b[:3, 3].norm()),
-    }
+    apart = pose_deviation(a, b, unit=b[:3, 3].norm())
+    return {"degrees_apart": float(apart.rotation), "distance_apart": float(apart.translation)}
 
 
 def _index_arrays(representation: ObjectRepresentation) -> tuple[Array, Array, Array]:

@@ -13,6 +13,7 @@ from foundpose.geometry.cameras import (
     unproject_pixels,
 )
 from foundpose.geometry.crop import Crops, PerspectiveCrop
+from foundpose.geometry.deviation import PoseDeviation, perturbed_poses, pose_deviation
 from foundpose.geometry.patch_grid import PatchGrid
 from foundpose.geometry.symmetries import (
     Symmetries,
@@ -42,6 +43,7 @@ __all__ = [
     "Crops",
     "PatchGrid",
     "PerspectiveCrop",
+    "PoseDeviation",
     "SphereInplane",
     "SuperFibonacci",
     "Symmetries",
@@ -58,8 +60,10 @@ __all__ = [
     "masks_from_boxes",
     "nearest_axis_angles",
     "no_symmetries",
+    "perturbed_poses",
     "pixel_grid",
     "pixel_rays",
+    "pose_deviation",
     "project_points",
     "project_to_rotation",
     "resize_intrinsics",

@@ -5,7 +5,8 @@ Imports pytorch_lightning, as only ``foundpose.evaluation`` does besides.
 
 from foundpose.training.adapter import AdapterTraining, PairLoss, PairPoses
 from foundpose.training.data import EpochShuffle, PairDataModule
-from foundpose.training.evaluation import SceneErrors, compare, evaluate_scenes, summarize
+from foundpose.training.errors import PoseErrors, compare, summarize
+from foundpose.training.evaluation import evaluate_refiner, evaluate_scenes
 from foundpose.training.pairs import PairBatch, PairSettings, PatchPairs, make_pairs
 from foundpose.training.refiner import RefinerLoss, RefinerTraining, disentangled_error
 from foundpose.training.refiner_data import (
@@ -16,12 +17,6 @@ from foundpose.training.refiner_data import (
     RefinerDataModule,
     RefinerPictures,
     RendererPerMesh,
-)
-from foundpose.training.refiner_evaluation import (
-    RefinementErrors,
-    compare_refinement,
-    evaluate_refiner,
-    summarize_refinement,
 )
 from foundpose.training.views import (
     TemplateViews,
@@ -43,18 +38,16 @@ __all__ = [
     "PatchPairs",
     "Perturbation",
     "PictureSettings",
-    "RefinementErrors",
+    "PoseErrors",
     "RefinerBatch",
     "RefinerDataModule",
     "RefinerLoss",
     "RefinerPictures",
     "RefinerTraining",
     "RendererPerMesh",
-    "SceneErrors",
     "TemplateViews",
     "TrueCrops",
     "compare",
-    "compare_refinement",
     "disentangled_error",
     "evaluate_refiner",
     "evaluate_scenes",
@@ -63,5 +56,4 @@ __all__ = [
     "render_crops",
     "render_templates",
     "summarize",
-    "summarize_refinement",
 ]

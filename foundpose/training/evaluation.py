@@ -1,43 +1,26 @@
-"""How right the poses of rendered scenes are, before and after training."""
+"""How right poses are: those of an object in rendered scenes, and perturbed ones after a refiner."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from typing import NamedTuple
+from itertools import islice
 
 import torch
 from torch import Tensor, nn
 
-from foundpose.geometry import Symmetries, rotation_angle
+from foundpose.geometry import Symmetries, pose_deviation, rotation_angle
 from foundpose.losses import geodesic_rotation_error, point_matching_error
 from foundpose.losses.alignment import best_symmetry
 from foundpose.losses.points import nearest_angles_of_points
 from foundpose.losses.reduction import mean_norm, place_points
 from foundpose.onboarding import Progress
 from foundpose.pipeline import FoundPose
-from foundpose.rendering import Mesh, Renderer
+from foundpose.refinement import RenderAndCompareRefiner
+from foundpose.rendering import Mesh
 from foundpose.representation import ObjectRepresentation
 from foundpose.retrieval import QueryPatches, RetrievedTemplates, Retriever
-from foundpose.synthetic import LightVariation, cluttered_scene
-
-RIGHT_DEGREES = 10.0
-RIGHT_DIAMETERS = 0.1
-
-
-class SceneErrors(NamedTuple):
-    """Errors of N poses, against whichever of the equivalent true poses of a symmetric object is nearest.
-
-    Attributes:
-        rotation: (N,) degrees; 180 where no pose was found.
-        translation: (N,) diameters; infinite where no pose was found. The nearest true pose is here the one of the
-            least mean squared distance of the model's points.
-        matching: (N,) mean distance of the model's points in diameters, at most 1; 1 where no pose was found.
-        right: (N,) bool, within 10 degrees and a tenth of the diameter.
-    """
-
-    rotation: Tensor
-    translation: Tensor
-    matching: Tensor
-    right: Tensor
+from foundpose.synthetic import SyntheticScene
+from foundpose.training.errors import PoseErrors, join_errors
+from foundpose.training.refiner_data import RefinerBatch, RefinerPictures
 
 
 class GivenTemplates(Retriever):
@@ -65,66 +48,45 @@ def evaluate_scenes(
     pipeline: FoundPose,
     representation: ObjectRepresentation,
     mesh: Mesh,
-    seeds: Sequence[int],
-    renderer: Renderer,
-    light: LightVariation | None = None,
-    occlusion: bool = True,
+    scenes: Iterable[SyntheticScene],
     batch_size: int = 8,
-    progress: Progress | None = None,
     symmetries: Symmetries | None = None,
-) -> dict[str, SceneErrors]:
-    """Estimate an object's pose in cluttered scenes.
+) -> dict[str, PoseErrors]:
+    """Estimate an object's pose in pictures with known truth.
 
     Args:
         pipeline: the method; measured in eval mode, and left as it was.
         representation: the object, onboarded.
         mesh: the object.
-        seeds: one scene each.
-        renderer: draws the scenes.
-        light: how their light varies.
-        occlusion: hide a corner of the object.
-        batch_size: scenes at a time.
-        progress: is told of every batch.
+        scenes: the pictures; taken one batch at a time.
+        batch_size: pictures at a time.
         symmetries: of the object, one entry; None: it has none, so that a pose which only looks right is wrong.
 
     Returns:
         Errors with the "retrieved" templates, and with the "nearest" one given, which leaves out retrieval.
     """
+    given = GivenTemplates()
+    told = FoundPose(
+        pipeline.crop, pipeline.extractor, given, pipeline.hypotheses, pipeline.refiner, pipeline.refine
+    )
+    R_template = representation.T_template_from_model[:, :3, :3]
+    parts: dict[str, list[PoseErrors]] = {"retrieved": [], "nearest": []}
+    left = iter(scenes)
     with _eval_mode(pipeline):
-        given = GivenTemplates()
-        told = FoundPose(
-            pipeline.crop,
-            pipeline.extractor,
-            given,
-            pipeline.hypotheses,
-            pipeline.refiner,
-            pipeline.refine,
-        ).eval()
-        device = representation.points_model.device
-        parts: dict[str, list[SceneErrors]] = {"retrieved": [], "nearest": []}
-        for start in range(0, len(seeds), batch_size):
-            chunk = seeds[start : start + batch_size]
-            scenes = [
-                cluttered_scene(mesh, s, occlusion=occlusion, renderer=renderer, light=light) for s in chunk
-            ]
-            image, K, mask, T_true = (torch.stack(field).to(device) for field in zip(*scenes, strict=True))
+        while chunk := list(islice(left, batch_size)):
+            image, K, mask, T_true = (
+                torch.stack(field).to(R_template.device) for field in zip(*chunk, strict=True)
+            )
             found = pipeline(image, K, representation, masks=mask, meshes=mesh)
             T_crop = found.crops.T_crop_from_camera @ T_true
-            R_template = representation.T_template_from_model[:, :3, :3]
-            given.index = rotation_angle(T_crop[:, None, :3, :3], R_template[None]).argmin(
-                dim=1, keepdim=True
-            )
+            angles = rotation_angle(T_crop[:, None, :3, :3], R_template[None])
+            given.index = angles.argmin(dim=1, keepdim=True)
             helped = told(image, K, representation, masks=mask, meshes=mesh)
             for name, estimates in (("retrieved", found), ("nearest", helped)):
                 parts[name].append(
                     pose_errors(estimates.T_camera_from_model, estimates.valid, T_true, mesh, symmetries)
                 )
-            if progress is not None:
-                progress("scenes", start + len(chunk), len(seeds))
-    return {
-        name: SceneErrors(*(torch.cat(field) for field in zip(*errors, strict=True)))
-        for name, errors in parts.items()
-    }
+    return {name: join_errors(errors) for name, errors in parts.items()}
 
 
 @contextmanager
@@ -141,10 +103,11 @@ def _eval_mode(module: nn.Module) -> Iterator[None]:
 
 def pose_errors(
     T_est: Tensor, valid: Tensor, T_true: Tensor, mesh: Mesh, symmetries: Symmetries | None = None
-) -> SceneErrors:
+) -> PoseErrors:
     """Errors of poses (N, 4, 4) against true ones, on the CPU; no pose has the largest errors.
 
-    ``symmetries`` are those of the object, one entry; None: it has none.
+    ``symmetries`` are those of the object, one entry; None: it has none. Of equivalent true poses, a displacement is
+    from the one of the least mean squared distance of the model's points.
     """
     T_est, valid, T_true = T_est.cpu(), valid.cpu(), T_true.cpu()
     diameter = float(mesh.diameter)
@@ -153,14 +116,15 @@ def pose_errors(
     if symmetries is not None:
         symmetries = symmetries.to("cpu", T_est.dtype).gather(torch.zeros(len(T_est), dtype=torch.int64))
         T_nearest = _nearest_truth(T_est, T_true, symmetries, points[None])
+    _, lateral, depth = pose_deviation(T_est, T_nearest, diameter)
     rotation = torch.rad2deg(geodesic_rotation_error(T_est, T_true, symmetries))
-    rotation = torch.where(valid, rotation, 180.0)
-    distance = torch.linalg.vector_norm(T_est[:, :3, 3] - T_nearest[:, :3, 3], dim=-1) / diameter
-    distance = torch.where(valid, distance, torch.inf)
     matching = point_matching_error(T_est, T_true, points, symmetries, norm="l2") / diameter
-    matching = torch.where(valid, matching, torch.inf).clamp(max=1.0)
-    return SceneErrors(
-        rotation, distance, matching, (rotation < RIGHT_DEGREES) & (distance < RIGHT_DIAMETERS)
+    return PoseErrors(
+        torch.where(valid, rotation, 180.0),
+        torch.where(valid, lateral, torch.inf),
+        torch.where(valid, depth, torch.inf),
+        torch.where(valid, matching, torch.inf).clamp(max=1.0),
+        valid,
     )
 
 
@@ -174,35 +138,40 @@ def _nearest_truth(T_est: Tensor, T_true: Tensor, symmetries: Symmetries, points
     return T_true @ best_symmetry(error, symmetries, angles, refine=False)
 
 
-def summarize(errors: SceneErrors) -> dict[str, float]:
-    """Share of right poses with its standard error, median rotation error and mean matching error with its own."""
-    count = len(errors.right)
-    share = float(errors.right.float().mean())
-    return {
-        "scenes": count,
-        "right": share,
-        "right_standard_error": (share * (1 - share) / count) ** 0.5,
-        "median_rotation_degrees": float(errors.rotation.median()),
-        "mean_matching_error": float(errors.matching.mean()),
-        "matching_standard_error": float(errors.matching.std(correction=0)) / count**0.5,
-    }
+@torch.no_grad()  # a measurement
+def evaluate_refiner(
+    refiner: RenderAndCompareRefiner,
+    pictures: RefinerPictures,
+    batch_size: int = 32,
+    progress: Progress | None = None,
+) -> tuple[PoseErrors, PoseErrors]:
+    """Errors of the pictures' perturbed poses, before and after refining them, at the objects' centres.
 
+    Where the refiner gives no pose, the errors after are those before.
 
-def compare(before: SceneErrors, after: SceneErrors) -> dict[str, float]:
-    """Differences after minus before on the same scenes, with the standard errors of paired differences.
-
-    ``gained`` and ``lost`` count the scenes whose pose became right or wrong.
+    Args:
+        refiner: on any device.
+        pictures: one perturbation of each is taken.
+        batch_size: pictures at a time.
+        progress: is told of every batch.
     """
-    if len(before.right) != len(after.right):
-        raise ValueError(f"these are {len(before.right)} and {len(after.right)} scenes, not the same ones")
-    count = len(before.right)
-    right = after.right.float() - before.right.float()
-    matching = after.matching - before.matching
-    return {
-        "gained": int((right > 0).sum()),
-        "lost": int((right < 0).sum()),
-        "right": float(right.mean()),
-        "right_standard_error": float(right.std(correction=0)) / count**0.5,
-        "mean_matching_error": float(matching.mean()),
-        "matching_standard_error": float(matching.std(correction=0)) / count**0.5,
-    }
+    device = next((p.device for p in refiner.parameters()), torch.device("cpu"))
+    before, after = [], []
+    for start in range(0, len(pictures), batch_size):
+        batch = pictures.__getitems__(range(start, min(start + batch_size, len(pictures))))
+        count = len(batch.images)
+        images, K, T_start = (x.to(device) for x in (batch.images, batch.K, batch.T_start))
+        index = torch.arange(count, device=device)
+        found = refiner.refine(images, K, T_start, index, batch.meshes, batch.mesh_index.to(device))
+        centre = pictures.centre[batch.mesh_index]
+        before.append(_errors(batch.T_start, torch.ones(count, dtype=torch.bool), batch, centre))
+        after.append(_errors(found.T_camera_from_model.cpu(), found.valid.cpu(), batch, centre))
+        if progress is not None:
+            progress("poses", start + count, len(pictures))
+    return join_errors(before), join_errors(after)
+
+
+def _errors(T: Tensor, valid: Tensor, batch: RefinerBatch, centre: Tensor) -> PoseErrors:
+    matching = point_matching_error(T, batch.T_true, batch.surface, diameter=batch.diameter, norm="l2")
+    deviation = pose_deviation(T, batch.T_true, batch.diameter, centre)
+    return PoseErrors(*deviation, matching.clamp(max=1.0), valid)

@@ -15,7 +15,6 @@ from foundpose.refinement import (
     RefinedPoses,
     RefinerChain,
 )
-from foundpose.refinement.convergence import nearest_templates, perturbed_poses, pose_deviation
 from foundpose.rendering import CoordinateRenderer
 from foundpose.rendering.coordinates import render_coordinate_image
 from foundpose.retrieval import SoftAssignBow, TemplateRetriever
@@ -161,29 +160,6 @@ def test_gradients_pass_through_refinement(views, oracle_blob):
 def test_bad_arguments():
     with pytest.raises(ValueError, match="refine must be one of"):
         make_pipeline(refine="some")
-
-
-def test_deviations_and_perturbations():
-    generator = torch.Generator().manual_seed(0)
-    T = pose_at(procedural_mesh(3, subdivisions=3), (300.0, 230.0), 700.0, 0).expand(200, 4, 4)
-    degrees, distance = torch.linspace(0.5, 15, 200), torch.linspace(1, 20, 200)
-    moved = perturbed_poses(T, degrees, distance, generator)
-    found = pose_deviation(moved, T, diameter=100.0)
-    torch.testing.assert_close(found.rotation, degrees, atol=1e-2, rtol=0)
-    whole = (found.lateral.square() + found.depth.square()).sqrt()
-    torch.testing.assert_close(whole, distance / 100, atol=1e-4, rtol=0)
-    assert not found.converged()[50:].any()
-    assert pose_deviation(T, T, 100.0).converged().all()
-    # Directions are spread evenly: a third of the squared length lies along the sight.
-    assert abs((found.depth.square() / whole.square()).mean() - 1 / 3) < 0.08
-
-
-def test_nearest_templates(oracle_blob):
-    T = oracle_blob.T_template_from_model
-    pick = torch.tensor([3, 77, 12])
-    moved = T[pick].clone()
-    moved[:, :3, 3] *= 1.4  # the same view from farther away
-    assert torch.equal(nearest_templates(moved, T), pick)
 
 
 def recorded_problem(pipeline, *args, **kwargs):

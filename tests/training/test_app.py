@@ -156,7 +156,7 @@ def test_train_resume_and_refuse(monkeypatch, tmp_path, capsys, bodies):
     assert [s.valid.tolist() for s in measured] == [[[True, True]]] * 2
     assert set(facts["results"]) == {"retrieved", "nearest"}
     for rows in facts["results"].values():
-        assert rows["before"]["scenes"] == rows["after"]["scenes"] == 3
+        assert rows["before"]["poses"] == rows["after"]["poses"] == 3
         assert rows["change"]["right"] == pytest.approx(rows["after"]["right"] - rows["before"]["right"])
     assert facts["settings"]["scenes"] == 3
     run = tmp_path / "run"

@@ -9,7 +9,8 @@ from foundpose.matching import PatchMatcher
 from foundpose.pipeline import FoundPose, MatchAndSolve
 from foundpose.pnp import RansacPnp
 from foundpose.retrieval import QueryPatches, TemplateRetriever
-from foundpose.training import SceneErrors, compare, evaluate_scenes, summarize
+from foundpose.synthetic import cluttered_scene
+from foundpose.training import PoseErrors, compare, evaluate_scenes, summarize
 from foundpose.training.evaluation import GivenTemplates, pose_errors
 
 
@@ -32,7 +33,8 @@ def test_pose_errors_of_known_poses(bodies):
     errors = pose_errors(estimates, torch.tensor([True, True, True, True, False]), truth, mesh)
     assert errors.right.tolist() == [True, True, False, False, False]
     assert torch.allclose(errors.rotation, torch.tensor([0.0, 9.0, 11.0, 0.0, 180.0]), atol=0.05)
-    assert torch.allclose(errors.translation, torch.tensor([0.0, 0.0, 0.0, 0.2, torch.inf]), atol=1e-5)
+    assert torch.allclose(errors.lateral, torch.tensor([0.0, 0.0, 0.0, 0.2, torch.inf]), atol=1e-5)
+    assert torch.allclose(errors.depth, torch.tensor([0.0, 0.0, 0.0, 0.0, torch.inf]), atol=1e-5)
     # A shift moves every point by itself; a turn by the chord at the mean distance from the axis.
     radius = mesh.vertices[:: len(mesh.vertices) // 1000, :2].norm(dim=1).mean() / mesh.diameter
     chord = 2 * math.sin(math.radians(4.5)) * radius
@@ -56,42 +58,42 @@ def test_pose_errors_of_symmetric_objects(bodies):
     errors = pose_errors(spun, found, truth, mesh, symmetries)
     assert errors.right.all()
     assert errors.rotation.max() < 0.1
-    assert errors.translation.max() < 1e-3
+    assert torch.hypot(errors.lateral, errors.depth).max() < 1e-3
     assert errors.matching.max() < 1e-3
     without = pose_errors(spun, found, truth, mesh)
     assert torch.allclose(without.rotation, torch.rad2deg(angles), atol=0.1)
     assert without.right.tolist() == [True, False, False]
-    assert (without.translation[1:] > 0.05).all()
+    assert (torch.hypot(without.lateral, without.depth)[1:] > 0.05).all()
     # A tilt in the object's frame off the axis, after a spin: as far off as the tilt alone.
     errors = pose_errors(spun @ tilt, found, truth, mesh, symmetries)
     alone = pose_errors(truth @ tilt, found, truth, mesh, symmetries)
-    for name in ("rotation", "translation", "matching"):
+    for name in ("rotation", "lateral", "depth", "matching"):
         one, all_ = getattr(alone, name), getattr(errors, name)
         assert torch.allclose(one, all_, atol=2e-3 if name != "rotation" else 0.1), name
     assert 5.0 < alone.rotation[0] < 10.0
 
 
 def errors_of(rotation, matching):
-    rotation = torch.tensor(rotation)
-    return SceneErrors(rotation, torch.zeros(len(rotation)), torch.tensor(matching), rotation < 10)
+    nothing = torch.zeros(len(rotation))
+    return PoseErrors(torch.tensor(rotation), nothing, nothing, torch.tensor(matching), nothing == 0)
 
 
 def test_summary_and_paired_comparison():
     before = errors_of([1.0, 20.0, 30.0, 2.0], [0.1, 0.5, 0.9, 0.1])
     after = errors_of([1.0, 2.0, 3.0, 25.0], [0.1, 0.1, 0.2, 0.4])
     summary = summarize(after)
-    assert summary["scenes"] == 4
+    assert summary["poses"] == 4
     assert summary["right"] == 0.75
     assert summary["right_standard_error"] == pytest.approx(math.sqrt(0.75 * 0.25 / 4))
-    assert summary["mean_matching_error"] == pytest.approx(0.2)
+    assert summary["mean_matching"] == pytest.approx(0.2)
     change = compare(before, after)
     assert (change["gained"], change["lost"]) == (2, 1)
     assert change["right"] == 0.25
     difference = [0.0, 1.0, 1.0, -1.0]
     deviation = math.sqrt(sum((d - 0.25) ** 2 for d in difference) / 4)
     assert change["right_standard_error"] == pytest.approx(deviation / 2)
-    assert change["mean_matching_error"] == pytest.approx(-0.2)
-    with pytest.raises(ValueError, match="4 and 1 scenes"):
+    assert change["mean_matching"] == pytest.approx(-0.2)
+    with pytest.raises(ValueError, match="4 and 1 poses"):
         compare(before, errors_of([1.0], [0.1]))
 
 
@@ -106,35 +108,26 @@ def test_scenes_with_retrieved_and_with_nearest_templates(bodies, sift_onboarder
     ).train()
     pipeline.extractor.eval()
     modes = [part.training for part in pipeline.modules()]
-    seeds = [4, 7, 9]
-    steps = []
-    errors = evaluate_scenes(
-        pipeline,
-        representation,
-        mesh,
-        seeds,
-        sift_onboarder.renderer,
-        batch_size=2,
-        progress=lambda stage, done, total: steps.append((done, total)),
-    )
-    assert steps == [(2, 3), (3, 3)]
+
+    def scenes(*seeds):
+        return (cluttered_scene(mesh, seed, renderer=sift_onboarder.renderer) for seed in seeds)
+
+    sizes = []
+    hook = pipeline.crop.register_forward_hook(lambda _, inputs, __: sizes.append(len(inputs[0])))
+    errors = evaluate_scenes(pipeline, representation, mesh, scenes(4, 7, 9), batch_size=2)
+    hook.remove()
+    assert sizes == [2, 2, 1, 1]
     # Measured in eval mode, the caller's modules are left in their own modes.
     assert [part.training for part in pipeline.modules()] == modes
     assert len(set(modes)) == 2
-    alone = evaluate_scenes(pipeline, representation, mesh, [9], sift_onboarder.renderer)
+    alone = evaluate_scenes(pipeline, representation, mesh, scenes(9))
     for mode in ("retrieved", "nearest"):
         assert errors[mode].rotation.shape == (3,)
         assert torch.allclose(errors[mode].rotation[2:], alone[mode].rotation, atol=0.5)
     # Had the object the symmetry of a half turn, no error would be larger and some would be smaller.
     half_turn = {"symmetries_discrete": [[-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]]}
-    forgiving = evaluate_scenes(
-        pipeline,
-        representation,
-        mesh,
-        seeds,
-        sift_onboarder.renderer,
-        symmetries=symmetries_from_models_info(half_turn),
-    )
+    symmetries = symmetries_from_models_info(half_turn)
+    forgiving = evaluate_scenes(pipeline, representation, mesh, scenes(4, 7, 9), symmetries=symmetries)
     for mode in ("retrieved", "nearest"):
         assert (forgiving[mode].rotation <= errors[mode].rotation + 0.5).all()
         assert (forgiving[mode].matching <= errors[mode].matching + 0.01).all()

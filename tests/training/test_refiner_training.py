@@ -20,15 +20,15 @@ from foundpose.training import (
     EndlessShuffle,
     Perturbation,
     PictureSettings,
-    RefinementErrors,
+    PoseErrors,
     RefinerDataModule,
     RefinerPictures,
     RefinerTraining,
     RendererPerMesh,
-    compare_refinement,
+    compare,
     disentangled_error,
     evaluate_refiner,
-    summarize_refinement,
+    summarize,
 )
 from tests.bop_dataset import write_ply
 
@@ -220,17 +220,17 @@ def test_errors_and_their_summary(pictures):
     batch = pictures.__getitems__(range(12))
     angle = torch.rad2deg(rotation_angle(batch.T_start[:, :3, :3], batch.T_true[:, :3, :3]))
     torch.testing.assert_close(before.rotation, angle)
-    half = RefinementErrors(*(x / 2 if x.is_floating_point() else x for x in before))
-    change = compare_refinement(before, half)
+    half = PoseErrors(*(x / 2 if x.is_floating_point() else x for x in before))
+    change = compare(before, half)
     assert change["rotation_improved"] == change["matching_improved"] == 1.0
     assert change["mean_matching"] == pytest.approx(-float(before.matching.mean()) / 2)
-    summary = summarize_refinement(before)
+    summary = summarize(before)
     assert summary["poses"] == 12
-    assert summary["valid"] == 1.0
+    assert summary["found"] == 1.0
     assert summary["median_rotation"] == float(before.rotation.median())
     assert 0 < summary["median_rotation_standard_error"] < float(before.rotation.std())
     with pytest.raises(ValueError, match="12 and 3 poses"):
-        compare_refinement(before, RefinementErrors(*(x[:3] for x in half)))
+        compare(before, PoseErrors(*(x[:3] for x in half)))
 
 
 def test_one_renderer_for_each_mesh(bodies, pictures):
