@@ -26,8 +26,9 @@ from foundpose.geometry import (
     pose_deviation,
     project_to_rotation,
 )
-from foundpose.refinement import PoseProposals, RefinedPoses
+from foundpose.refinement import Observation, PoseProposals
 from foundpose.rendering import load_mesh
+from foundpose.representation import ObjectGroups
 from foundpose.utils.files import write_atomically
 from foundpose.utils.progress import ProgressBars
 
@@ -81,18 +82,20 @@ def run(cfg: DictConfig, output: Path) -> None:
             score=torch.zeros(1, len(degrees)).to(K),
             valid=torch.ones(1, len(degrees), dtype=torch.bool, device=K.device),
             template_index=template.expand(1, len(degrees)),
+        )
+        observation = Observation(
             crops=estimates.crops,
             features=features,
             grid=method.pipeline.extractor.patch_grid(method.pipeline.crop.size),
-            objects=[representation],
-            object_index=torch.zeros(1, dtype=torch.int64),
+            query=estimates.query,
+            groups=ObjectGroups([representation], None, 1, K.device),
             images=image,
             K=K,
             image_index=torch.zeros(1, dtype=torch.int64),
             meshes=[mesh],
         )
         with torch.no_grad():
-            refined: RefinedPoses = method.pipeline.refiner(proposals)
+            refined: PoseProposals = method.pipeline.refiner(proposals, observation)
         poses = {
             "coarse": (estimates.T_coarse, T_true),
             "coarse, refined": (estimates.T_camera_from_model, T_true),

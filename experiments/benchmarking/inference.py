@@ -309,12 +309,12 @@ def backward_tasks(
     if stages.refiner is not None:
         refiner = stages.refiner
         for name, key in ((REFINE_ONE, "refiner"), (refine_all_name(h), "refiner of all")):
-            (proposals,) = inputs[key]
-            patches = _leaf(proposals.features.patches)
-            given = proposals._replace(features=proposals.features._replace(patches=patches))
+            proposals, observation = inputs[key]
+            patches = _leaf(observation.features.patches)
+            given = observation._replace(features=observation.features._replace(patches=patches))
 
-            def refine(given: Any = given) -> Tensor:
-                return refiner(given).T_crop_from_model
+            def refine(proposals: Any = proposals, given: Any = given) -> Tensor:
+                return refiner(proposals, given).T_crop_from_model
 
             tasks.append(task(f"{name}, w.r.t. the feature map", partial(_gradient, refine, [patches])))
         features = _leaf(workload.features)

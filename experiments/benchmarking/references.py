@@ -20,7 +20,7 @@ from benchmarking.workload import Workload
 from foundpose.geometry import pose_deviation
 from foundpose.onboarding import Progress
 from foundpose.pnp import LevenbergMarquardtPnp, RansacPnp
-from foundpose.refinement import FeaturemetricRefiner
+from foundpose.refinement import FeaturemetricRefiner, Observation, PoseProposals
 from foundpose.refinement.refiners import alignment_problem
 from foundpose.representation import ObjectRepresentation
 from foundpose.retrieval import SpatialReranker, TemplateRetriever, VisualWords
@@ -141,7 +141,7 @@ def inference_references(stages: Stages, workload: Workload) -> list[Reference]:
     references += _pnp_references(stages, stages.pnp, inputs["pnp"], coarse.templates.index.shape[1])
     references.append(_polish_reference(stages.pnp, inputs["pnp"]))
     if isinstance(stages.refiner, FeaturemetricRefiner):
-        references.append(_refinement_reference(stages.refiner, inputs["refiner"][0]))
+        references.append(_refinement_reference(stages.refiner, *inputs["refiner"]))
     return references
 
 
@@ -257,20 +257,13 @@ def _polish_reference(pnp: RansacPnp, arguments: list[Any]) -> Reference:
     )
 
 
-def _refinement_reference(refiner: FeaturemetricRefiner, proposals: Any) -> Reference:
+def _refinement_reference(
+    refiner: FeaturemetricRefiner, proposals: PoseProposals, observation: Observation
+) -> Reference:
     """One featuremetric refinement: the first crop's."""
     from benchmarking.least_squares import UNSUPPORTED, featuremetric_least_squares, is_supported
 
-    problem = alignment_problem(proposals)
-    alignment = refiner.alignment
-    one = problem._replace(
-        features=problem.features[:1],
-        map_index=problem.map_index[:1],
-        K=problem.K[:1],
-        descriptors=problem.descriptors[:1],
-        points_model=problem.points_model[:1],
-        valid=problem.valid[:1],
-    )
+    alignment, one = refiner.alignment, alignment_problem(proposals, observation).take(slice(1))
     start = proposals.T_crop_from_model[0, :1]
 
     def agreement(ours: Tensor, theirs: Tensor) -> dict[str, float]:

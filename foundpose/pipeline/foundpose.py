@@ -8,19 +8,19 @@ from torch import Tensor, nn
 
 from foundpose.features.base import Fingerprint, PatchExtractor
 from foundpose.geometry import Crops, PerspectiveCrop
-from foundpose.pipeline.grouping import ObjectGroups, take_rows
 from foundpose.pipeline.hypotheses import HypothesisMaker
 from foundpose.pipeline.query import project_query, select_query_patches
-from foundpose.pipeline.results import PoseEstimates, PoseStatus
+from foundpose.pipeline.results import PoseEstimates
 from foundpose.pipeline.selection import (
     RefineWhat,
     choose_coarse,
     choose_refined,
     hypotheses_to_refine,
+    propose,
 )
-from foundpose.refinement import PoseProposals, PoseRefiner, RefinedPoses
+from foundpose.refinement import Observation, PoseRefiner
 from foundpose.rendering import Mesh
-from foundpose.representation import ObjectRepresentation, RepresentationInfo
+from foundpose.representation import ObjectGroups, ObjectRepresentation, RepresentationInfo, take_rows
 from foundpose.retrieval import Retriever
 from foundpose.utils.warn import warn_caller
 
@@ -130,35 +130,28 @@ class FoundPose(nn.Module):
         features = self.extractor(crops.images)
         # Autocast is for the extractor: elsewhere half precision moves points and changes neighbours.
         with torch.autocast(crops.images.device.type, enabled=False):
-            query = project_query(select_query_patches(features, crops, self.extractor), groups)
+            observation = Observation(
+                crops,
+                features,
+                self.extractor.patch_grid(self.crop.size),
+                project_query(select_query_patches(features, crops, self.extractor), groups),
+                groups,
+                images,
+                K,
+                torch.arange(len(crops.images)) if image_index is None else image_index,
+                [meshes] if isinstance(meshes, Mesh) else meshes,
+            )
+            query = observation.query
             templates = groups.map(lambda obj, rows: self.retriever(take_rows(query, rows), obj))
-            found = self.hypotheses(query, templates, crops, groups)
-            estimates = choose_coarse(crops, query, templates, found)
+            found = self.hypotheses(templates, observation)
+            estimates = choose_coarse(observation, templates, found)
             if self.refiner is None:
                 return estimates
             chosen = hypotheses_to_refine(estimates, self.refine)
-            hypotheses = found.hypotheses
-            proposals = PoseProposals(
-                T_crop_from_model=torch.take_along_dim(
-                    hypotheses.T_crop_from_model, chosen[..., None, None], dim=1
-                ),
-                score=hypotheses.score.gather(1, chosen).to(crops.K_crop.dtype),
-                valid=(hypotheses.status.gather(1, chosen) == PoseStatus.OK) & crops.valid[:, None],
-                template_index=templates.index.gather(1, chosen),
-                crops=crops,
-                features=features,
-                grid=self.extractor.patch_grid(self.crop.size),
-                objects=objects,
-                object_index=groups.object_index,
-                images=images,
-                K=K,
-                image_index=torch.arange(len(crops.images)) if image_index is None else image_index,
-                meshes=[meshes] if isinstance(meshes, Mesh) else meshes,
-            )
-            refined: RefinedPoses = self.refiner(proposals)
-            score = self.hypotheses.score_refined(
-                refined.T_crop_from_model, hypotheses.num_inliers.gather(1, chosen), query, crops, groups
-            )
+            proposals = propose(estimates, chosen)
+            refined = self.refiner(proposals, observation)
+            num_inliers = estimates.hypotheses.num_inliers.gather(1, chosen)
+            score = self.hypotheses.score_refined(refined.T_crop_from_model, num_inliers, observation)
             if score is not None:
                 refined = refined._replace(score=score)
             return choose_refined(estimates, proposals, refined, chosen)

@@ -5,15 +5,15 @@ from abc import ABC, abstractmethod
 import torch
 from torch import Tensor, nn
 
-from foundpose.geometry import Crops, invert_transform
+from foundpose.geometry import invert_transform
 from foundpose.matching import PatchMatcher, SoftPatchMatcher
-from foundpose.pipeline.grouping import ObjectGroups, take_rows
 from foundpose.pipeline.results import Correspondences, Hypothesised, PoseHypotheses, PoseStatus
 from foundpose.pipeline.selection import better_of_two
 from foundpose.pipeline.verification import HypothesisScorer, InlierScore
 from foundpose.pnp import PnpResult, RansacPnp, TemplateStart, TopTemplatePose
 from foundpose.pnp.soft_selection import choose_softly
-from foundpose.representation import ObjectRepresentation
+from foundpose.refinement import Observation
+from foundpose.representation import ObjectRepresentation, take_rows
 from foundpose.retrieval import QueryPatches, RetrievedTemplates
 
 
@@ -21,25 +21,16 @@ class HypothesisMaker(nn.Module, ABC):
     """Finds a pose for each retrieved template of each crop."""
 
     @abstractmethod
-    def forward(
-        self, query: QueryPatches, templates: RetrievedTemplates, crops: Crops, groups: ObjectGroups
-    ) -> Hypothesised:
+    def forward(self, templates: RetrievedTemplates, observation: Observation) -> Hypothesised:
         """Find poses.
 
         Args:
-            query: patches of B crops, with the descriptors of each crop's object.
-            templates: h templates of each crop's object.
-            crops: the crops.
-            groups: which crop shows which object.
+            templates: h templates of the object of each of B crops.
+            observation: the crops, their patches and their objects.
         """
 
     def score_refined(
-        self,
-        T_crop_from_model: Tensor,
-        num_inliers: Tensor,
-        query: QueryPatches,
-        crops: Crops,
-        groups: ObjectGroups,
+        self, T_crop_from_model: Tensor, num_inliers: Tensor, observation: Observation
     ) -> Tensor | None:
         """Scores (B, n) of refined poses (B, n, 4, 4) on the scale of the hypotheses' own.
 
@@ -72,10 +63,9 @@ class MatchAndSolve(HypothesisMaker):
         self.scorer = InlierScore() if scorer is None else scorer
         self.start = start
 
-    def forward(
-        self, query: QueryPatches, templates: RetrievedTemplates, crops: Crops, groups: ObjectGroups
-    ) -> Hypothesised:
+    def forward(self, templates: RetrievedTemplates, observation: Observation) -> Hypothesised:
         """Match object by object; PnP for all crops and templates as one batch."""
+        query, crops, groups = observation.query, observation.crops, observation.groups
         found = groups.map(
             lambda obj, rows: self._match(obj, take_rows(query, rows), take_rows(templates, rows))
         )
@@ -96,13 +86,13 @@ class MatchAndSolve(HypothesisMaker):
                 inliers=result.inliers.reshape(B, h, P),
                 num_inliers=num_inliers,
                 status=result.status.reshape(B, h),
-                score=self._score(T, num_inliers, query, crops, groups),
+                score=self._score(T, num_inliers, observation),
             )
 
         result = self.pnp(*problem, found.priority.reshape(B * h, P))
         hypotheses = scored(result)
         if self.start is not None:
-            T_start = self._starts(self.start, found, templates, crops, groups)
+            T_start = self._starts(self.start, found, templates, observation)
             polished = self.pnp.polish_starts(T_start.reshape(B * h, 4, 4), *problem)
             hypotheses = better_of_two(hypotheses, scored(polished))
         candidates = None
@@ -114,17 +104,12 @@ class MatchAndSolve(HypothesisMaker):
         return Hypothesised(hypotheses, found, candidates)
 
     def score_refined(
-        self,
-        T_crop_from_model: Tensor,
-        num_inliers: Tensor,
-        query: QueryPatches,
-        crops: Crops,
-        groups: ObjectGroups,
+        self, T_crop_from_model: Tensor, num_inliers: Tensor, observation: Observation
     ) -> Tensor | None:
         """By the scorer, unless it looks at inliers alone."""
         if not self.scorer.judges_poses:
             return None
-        return self._score(T_crop_from_model, num_inliers, query, crops, groups)
+        return self._score(T_crop_from_model, num_inliers, observation)
 
     def _match(
         self, representation: ObjectRepresentation, query: QueryPatches, templates: RetrievedTemplates
@@ -157,8 +142,7 @@ class MatchAndSolve(HypothesisMaker):
         start: TemplateStart,
         found: Correspondences,
         templates: RetrievedTemplates,
-        crops: Crops,
-        groups: ObjectGroups,
+        observation: Observation,
     ) -> Tensor:
         """The templates' own poses (B, h, 4, 4), moved as the matches say."""
 
@@ -170,31 +154,25 @@ class MatchAndSolve(HypothesisMaker):
                 found.points_image[rows],
                 found.pixels_template[rows],
                 trust,
-                crops.K_crop[rows],
+                observation.crops.K_crop[rows],
                 obj.T_template_from_model[index],
                 obj.K_template[index],
                 obj.points_model.mean(dim=0),
             )
 
-        return groups.map(move)
+        return observation.groups.map(move)
 
-    def _score(
-        self,
-        T_crop_from_model: Tensor,
-        num_inliers: Tensor,
-        query: QueryPatches,
-        crops: Crops,
-        groups: ObjectGroups,
-    ) -> Tensor:
+    def _score(self, T_crop_from_model: Tensor, num_inliers: Tensor, observation: Observation) -> Tensor:
         """Scores (B, n) of poses (B, n, 4, 4)."""
+        query, K_crop = observation.query, observation.crops.K_crop
         share = num_inliers / query.valid.sum(dim=1, keepdim=True).clamp(min=1)
 
         def score(obj: ObjectRepresentation, rows: Tensor) -> Tensor:
             return self.scorer(
-                T_crop_from_model[rows], share[rows], take_rows(query, rows), crops.K_crop[rows], obj
+                T_crop_from_model[rows], share[rows], take_rows(query, rows), K_crop[rows], obj
             )
 
-        return groups.map(score)
+        return observation.groups.map(score)
 
 
 class TemplateHypotheses(HypothesisMaker):
@@ -212,11 +190,10 @@ class TemplateHypotheses(HypothesisMaker):
         super().__init__()
         self.pose = TopTemplatePose() if pose is None else pose
 
-    def forward(
-        self, query: QueryPatches, templates: RetrievedTemplates, crops: Crops, groups: ObjectGroups
-    ) -> Hypothesised:
+    def forward(self, templates: RetrievedTemplates, observation: Observation) -> Hypothesised:
         """Align the templates of each crop with its mask."""
-        poses = groups.map(
+        crops = observation.crops
+        poses = observation.groups.map(
             lambda obj, rows: self.pose(crops.masks[rows], crops.K_crop[rows], templates.index[rows], obj)
         )
         hypotheses = PoseHypotheses(

@@ -5,8 +5,7 @@ from torch import Tensor
 
 from foundpose.features.base import PatchExtractor, PatchFeatures
 from foundpose.geometry import Crops
-from foundpose.pipeline.grouping import ObjectGroups, take_rows
-from foundpose.representation import ObjectRepresentation
+from foundpose.representation import ObjectGroups, ObjectRepresentation, take_rows
 from foundpose.retrieval import QueryPatches
 
 

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from foundpose.geometry import Crops
 from foundpose.pnp import PnpStatus, PoseCandidates
-from foundpose.refinement.base import RefinedPoses
+from foundpose.refinement.base import PoseProposals
 from foundpose.retrieval import QueryPatches, RetrievedTemplates
 
 
@@ -117,4 +117,4 @@ class PoseEstimates(NamedTuple):
     hypotheses: PoseHypotheses
     correspondences: Correspondences | None = None
     candidates: PoseCandidates | None = None
-    refined: RefinedPoses | None = None
+    refined: PoseProposals | None = None

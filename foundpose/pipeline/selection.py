@@ -5,22 +5,19 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from foundpose.geometry import Crops, invert_transform
+from foundpose.geometry import invert_transform
 from foundpose.pipeline.results import Hypothesised, PoseEstimates, PoseHypotheses, PoseStatus
-from foundpose.refinement import PoseProposals, RefinedPoses
-from foundpose.retrieval import QueryPatches, RetrievedTemplates
+from foundpose.refinement import Observation, PoseProposals
+from foundpose.retrieval import RetrievedTemplates
 
 RefineWhat = Literal["best", "all"]
 
 
 def choose_coarse(
-    crops: Crops,
-    query: QueryPatches,
-    templates: RetrievedTemplates,
-    found: Hypothesised,
+    observation: Observation, templates: RetrievedTemplates, found: Hypothesised
 ) -> PoseEstimates:
     """Keep the hypothesis with the best score; of equal ones, that of the more similar template."""
-    hypotheses = found.hypotheses
+    crops, query, hypotheses = observation.crops, observation.query, found.hypotheses
     solved = hypotheses.status == PoseStatus.OK
     best = _first_of_best(hypotheses.score.detach().masked_fill(~solved, -torch.inf)).squeeze(1)
     row = torch.arange(len(best), device=best.device)
@@ -55,8 +52,19 @@ def hypotheses_to_refine(estimates: PoseEstimates, refine: RefineWhat) -> Tensor
     return torch.arange(h, device=estimates.best.device).expand(B, h)
 
 
+def propose(estimates: PoseEstimates, chosen: Tensor) -> PoseProposals:
+    """Some (B, n) of the hypotheses, to be refined."""
+    hypotheses, crops = estimates.hypotheses, estimates.crops
+    return PoseProposals(
+        T_crop_from_model=torch.take_along_dim(hypotheses.T_crop_from_model, chosen[..., None, None], dim=1),
+        score=hypotheses.score.gather(1, chosen).to(crops.K_crop.dtype),
+        valid=(hypotheses.status.gather(1, chosen) == PoseStatus.OK) & crops.valid[:, None],
+        template_index=estimates.templates.index.gather(1, chosen),
+    )
+
+
 def choose_refined(
-    estimates: PoseEstimates, proposals: PoseProposals, refined: RefinedPoses, rank: Tensor
+    estimates: PoseEstimates, proposals: PoseProposals, refined: PoseProposals, rank: Tensor
 ) -> PoseEstimates:
     """Keep the refined pose with the best score; a crop of which none could be refined keeps its coarse pose."""
     score = torch.where(refined.valid, refined.score.detach(), -torch.inf)

@@ -8,13 +8,38 @@ from torch import Tensor, nn
 
 from foundpose.geometry import camera_on_boxes, invert_transform, project_points, transform_points
 from foundpose.geometry.warp import warp_images
-from foundpose.refinement.base import PoseProposals, PoseRefiner, RefinedPoses
+from foundpose.refinement.base import Observation, PoseProposals, PoseRefiner
 from foundpose.refinement.pose_update import UPDATE_SIZE, apply_update
 from foundpose.rendering import Mesh, Renderer
 from foundpose.utils.devices import constant
 
 # Objects that come nearer than this share of their own depth are not rendered: they surround the camera.
 _NEAR = 0.01
+
+
+class PicturedObjects(NamedTuple):
+    """M objects in pictures.
+
+    Attributes:
+        images: (N, 3, H, W) in [0, 1].
+        K: (N, 3, 3) intrinsics.
+        image_index: (M,) which picture shows each object.
+        meshes: the objects' meshes.
+        mesh_index: (M,) which mesh each object has.
+    """
+
+    images: Tensor
+    K: Tensor
+    image_index: Tensor
+    meshes: Sequence[Mesh]
+    mesh_index: Tensor
+
+    def to(self, device: torch.device) -> "PicturedObjects":
+        """The same on a device."""
+        images, K, image_index, meshes, mesh_index = self
+        return PicturedObjects(
+            images.to(device), K.to(device), image_index.to(device), meshes, mesh_index.to(device)
+        )
 
 
 class Views(NamedTuple):
@@ -101,113 +126,81 @@ class RenderAndCompareRefiner(PoseRefiner):
         self.margin = margin
         self.antialias = antialias
 
-    def forward(self, proposals: PoseProposals) -> RefinedPoses:
+    def forward(self, proposals: PoseProposals, observation: Observation) -> PoseProposals:
         """Refine all valid proposals as one batch.
 
         Returns:
             Poses, scores (the network's, or those that came if it gives none) and which are valid.
 
         Raises:
-            ValueError: the proposals have no meshes, or the network's output has another shape.
+            ValueError: there are no meshes, or the network's output has another shape.
 
         Differentiable as :meth:`refine`; proposals that cannot be refined are passed through.
         """
-        meshes = proposals.meshes
+        meshes, groups = observation.meshes, observation.groups
         if meshes is None:
             raise ValueError(
                 "RenderAndCompareRefiner renders the objects: pass their meshes to FoundPose.forward (meshes=...)"
             )
-        if len(meshes) != len(proposals.objects):
-            raise ValueError(
-                f"got {len(meshes)} meshes for {len(proposals.objects)} objects; give one for each"
-            )
-        B, n = proposals.valid.shape
+        if len(meshes) != len(groups.objects):
+            raise ValueError(f"got {len(meshes)} meshes for {len(groups.objects)} objects; give one for each")
+        rows = torch.nonzero(proposals.valid)
+        crop, (B, n) = rows[:, 0], proposals.valid.shape
+        flat = crop * n + rows[:, 1]
         T_crop = proposals.T_crop_from_model.flatten(0, 1)
-        T_crop_from_camera = proposals.crops.T_crop_from_camera.to(T_crop).repeat_interleave(n, dim=0)
-        rows = torch.nonzero(proposals.valid.flatten()).flatten()
-        crop_of_row = rows.div(n, rounding_mode="floor")
-        result = self.refine(
-            proposals.images,
-            proposals.K,
-            invert_transform(T_crop_from_camera[rows]) @ T_crop[rows],
-            proposals.image_index.to(rows.device)[crop_of_row],
+        T_crop_from_camera = observation.crops.T_crop_from_camera.to(T_crop)[crop]
+        pictured = PicturedObjects(
+            observation.images,
+            observation.K,
+            observation.image_index.to(crop.device)[crop],
             meshes,
-            proposals.object_index.to(rows.device)[crop_of_row],
+            groups.object_index.to(crop.device)[crop],
         )
+        result = self.refine(invert_transform(T_crop_from_camera) @ T_crop[flat], pictured)
         refined = torch.where(
-            result.valid[:, None, None],
-            T_crop_from_camera[rows] @ result.T_camera_from_model,
-            T_crop[rows],
+            result.valid[:, None, None], T_crop_from_camera @ result.T_camera_from_model, T_crop[flat]
         )
-        score = proposals.score.flatten()
+        score = proposals.score
         if result.logit is not None:
-            ours = torch.where(result.valid, result.logit.sigmoid().to(score), torch.zeros_like(score[rows]))
-            score = torch.zeros_like(score).index_put((rows,), ours)
-        return RefinedPoses(
-            T_crop.index_put((rows,), refined).unflatten(0, (B, n)),
-            score.unflatten(0, (B, n)),
-            torch.zeros_like(proposals.valid).flatten().index_put((rows,), result.valid).unflatten(0, (B, n)),
+            ours = result.logit.sigmoid().to(score).where(result.valid, 0.0)
+            score = torch.zeros_like(score).index_put(tuple(rows.T), ours)
+        return proposals._replace(
+            T_crop_from_model=T_crop.index_put((flat,), refined).unflatten(0, (B, n)),
+            score=score,
+            valid=torch.zeros_like(proposals.valid).index_put(tuple(rows.T), result.valid),
         )
 
-    def refine(
-        self,
-        images: Tensor,
-        K: Tensor,
-        T_camera_from_model: Tensor,
-        image_index: Tensor,
-        meshes: Sequence[Mesh],
-        mesh_index: Tensor,
-    ) -> ComparedPoses:
-        """Refine M poses.
+    def refine(self, T_camera_from_model: Tensor, pictured: PicturedObjects) -> ComparedPoses:
+        """Refine M poses (M, 4, 4), mesh units, of objects in pictures.
 
-        Args:
-            images: (N, 3, H, W) in [0, 1].
-            K: (N, 3, 3) intrinsics.
-            T_camera_from_model: (M, 4, 4) poses, mesh units.
-            image_index: (M,) which picture shows each object.
-            meshes: the objects' meshes.
-            mesh_index: (M,) which mesh each pose is of.
-
-        Differentiable w.r.t. the network's parameters and ``images``. Renderings and virtual cameras are constants,
+        Differentiable w.r.t. the network's parameters and the pictures. Renderings and virtual cameras are constants,
         and between iterations the pose is detached, as in CosyPose: the gradient is that of the last update.
         """
-        T, valid = T_camera_from_model, torch.ones_like(mesh_index, dtype=torch.bool)
+        T, valid = T_camera_from_model, torch.ones_like(pictured.mesh_index, dtype=torch.bool)
         logit: Tensor | None = None
         for _ in range(self.iterations):
-            views = self.look(images, K, T.detach(), image_index, meshes, mesh_index)
+            views = self.look(T.detach(), pictured)
             update, logit = self.predict(views)
             valid = valid & views.valid
             T = self.move(views, update)
-        valid = valid & self._usable(T.detach(), images, K, image_index, meshes, mesh_index)[0]
+        valid = valid & self._usable(T.detach(), pictured)[0]
         return ComparedPoses(torch.where(valid[:, None, None], T, T_camera_from_model), logit, valid)
 
-    def look(
-        self,
-        images: Tensor,
-        K: Tensor,
-        T_camera_from_model: Tensor,
-        image_index: Tensor,
-        meshes: Sequence[Mesh],
-        mesh_index: Tensor,
-    ) -> Views:
-        """What the network sees of M poses; arguments as for :meth:`refine`.
-
-        Differentiable w.r.t. ``images``.
-        """
-        T = T_camera_from_model.detach()
-        dtype = torch.promote_types(images.dtype, torch.float32)
-        valid, boxes, T, K_camera, centre = self._usable(T, images, K, image_index, meshes, mesh_index)
+    def look(self, T_camera_from_model: Tensor, pictured: PicturedObjects) -> Views:
+        """What the network sees of objects at poses (M, 4, 4); differentiable w.r.t. the pictures."""
+        images = pictured.images.to(torch.promote_types(pictured.images.dtype, torch.float32))
+        valid, boxes, T, K_camera, centre = self._usable(T_camera_from_model.detach(), pictured)
         K_view, T_view_from_camera = camera_on_boxes(boxes, K_camera, self.size, 1.0 / self.margin)
         T_view = T_view_from_camera @ T
         homographies = K_view @ T_view_from_camera[:, :3, :3] @ torch.linalg.inv(K_camera)
         shrink = K_camera[:, [0, 1], [0, 1]].amax(1) / K_view[:, 0, 0]
         levels = shrink.clamp(min=1.0).log2() if self.antialias else torch.zeros_like(shrink)
         crops = warp_images(
-            images.to(dtype), homographies.to(dtype), image_index, levels.to(dtype), self.size
+            images, homographies.to(images), pictured.image_index, levels.to(images), self.size
         )
         renderings = torch.zeros_like(crops, requires_grad=False)
-        for i, mesh in enumerate(meshes):
-            rows = torch.nonzero((mesh_index == i) & valid).flatten()
+        for i, mesh in enumerate(pictured.meshes):
+            rows = torch.nonzero((pictured.mesh_index == i) & valid).flatten()
             if len(rows) > 0:
                 rendered = self.renderer(mesh, T_view[rows], K_view[rows], (self.size, self.size)).rgb
                 renderings[rows] = rendered.to(renderings)
@@ -237,24 +230,16 @@ class RenderAndCompareRefiner(PoseRefiner):
         T_view = apply_update(views.T_view_from_model, update, views.K, views.centre)
         return invert_transform(views.T_view_from_camera) @ T_view
 
-    def _usable(
-        self,
-        T: Tensor,
-        images: Tensor,
-        K: Tensor,
-        image_index: Tensor,
-        meshes: Sequence[Mesh],
-        mesh_index: Tensor,
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    def _usable(self, T: Tensor, pictured: PicturedObjects) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """Which poses can be rendered; boxes (M, 4) round their images, poses, intrinsics and meshes' centres.
 
         What cannot be used is replaced by something that can be computed with.
         """
-        height, width = images.shape[-2:]
-        bounds = torch.stack([mesh.bounds for mesh in meshes]).to(T)
-        low, high = bounds[mesh_index].unbind(1)
+        height, width = pictured.images.shape[-2:]
+        bounds = torch.stack([mesh.bounds for mesh in pictured.meshes]).to(T)
+        low, high = bounds[pictured.mesh_index].unbind(1)
         centre, radius = (low + high) / 2, torch.linalg.vector_norm(high - low, dim=-1) / 2
-        K = K.detach().to(T)[image_index]
+        K = pictured.K.detach().to(T)[pictured.image_index]
         focal = float(max(height, width))
         common = K.new_tensor(
             [[focal, 0.0, (width - 1) / 2], [0.0, focal, (height - 1) / 2], [0.0, 0.0, 1.0]]
@@ -269,8 +254,8 @@ class RenderAndCompareRefiner(PoseRefiner):
         T = torch.where(sound[:, None, None], T, ahead)
         valid &= sound & ((torch.linalg.det(T[:, :3, :3]) - 1.0).abs() < 0.1)
         boxes = torch.zeros_like(T[:, 0])
-        for i, mesh in enumerate(meshes):
-            rows = torch.nonzero(mesh_index == i).flatten()
+        for i, mesh in enumerate(pictured.meshes):
+            rows = torch.nonzero(pictured.mesh_index == i).flatten()
             if len(rows) > 0:
                 boxes[rows], in_front = self._boxes(mesh, T[rows], K[rows], centre[rows])
                 valid[rows] &= in_front

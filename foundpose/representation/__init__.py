@@ -1,5 +1,6 @@
 """What is known of an object, and how it is stored."""
 
+from foundpose.representation.groups import ObjectGroups, take_rows
 from foundpose.representation.object_representation import (
     ObjectRepresentation,
     RepresentationInfo,
@@ -7,4 +8,11 @@ from foundpose.representation.object_representation import (
     read_info,
 )
 
-__all__ = ["ObjectRepresentation", "RepresentationInfo", "TemplatePatches", "read_info"]
+__all__ = [
+    "ObjectGroups",
+    "ObjectRepresentation",
+    "RepresentationInfo",
+    "TemplatePatches",
+    "read_info",
+    "take_rows",
+]

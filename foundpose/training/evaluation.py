@@ -159,11 +159,9 @@ def evaluate_refiner(
     before, after = [], []
     for start in range(0, len(pictures), batch_size):
         batch = pictures.__getitems__(range(start, min(start + batch_size, len(pictures))))
-        count = len(batch.images)
-        images, K, T_start = (x.to(device) for x in (batch.images, batch.K, batch.T_start))
-        index = torch.arange(count, device=device)
-        found = refiner.refine(images, K, T_start, index, batch.meshes, batch.mesh_index.to(device))
-        centre = pictures.centre[batch.mesh_index]
+        count = len(batch.T_start)
+        found = refiner.refine(batch.T_start.to(device), batch.pictured.to(device))
+        centre = pictures.centre[batch.pictured.mesh_index]
         before.append(_errors(batch.T_start, torch.ones(count, dtype=torch.bool), batch, centre))
         after.append(_errors(found.T_camera_from_model.cpu(), found.valid.cpu(), batch, centre))
         if progress is not None:

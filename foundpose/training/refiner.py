@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from foundpose.losses import point_matching_error
-from foundpose.refinement import RenderAndCompareRefiner, apply_update, update_between
+from foundpose.refinement import RenderAndCompareRefiner, Views, apply_update, update_between
 from foundpose.training.refiner_data import RefinerBatch
 
 
@@ -29,25 +29,16 @@ class RefinerLoss(NamedTuple):
 
 
 def disentangled_error(
-    T_view_from_model: Tensor,
-    update: Tensor,
-    T_true: Tensor,
-    K: Tensor,
-    centre: Tensor,
-    surface: Tensor,
-    diameter: Tensor,
-    valid: Tensor,
+    views: Views, update: Tensor, T_true: Tensor, surface: Tensor, diameter: Tensor, valid: Tensor
 ) -> Tensor:
     """Point-matching errors of the parts of an update, each combined with the truth of the others.
 
     So a wrong depth does not teach the rotation to make up for it.
 
     Args:
-        T_view_from_model: (B, 4, 4) poses that were updated, in the network's virtual cameras.
+        views: B poses that were updated, in the network's virtual cameras.
         update: (B, 9) predicted updates.
-        T_true: (B, 4, 4) true poses in the same cameras.
-        K: (B, 3, 3) of the cameras.
-        centre: (B, 3) centres of the objects, model frame.
+        T_true: (B, 4, 4) true ``T_camera_from_model``, mesh units.
         surface: (B, P, 3) points of the objects, mesh units.
         diameter: (B,) mesh units.
         valid: (B,) bool.
@@ -59,12 +50,13 @@ def disentangled_error(
 
     Source: Labbé et al., "CosyPose", ECCV 2020.
     """
-    truth = update_between(T_view_from_model, T_true, K, centre)
+    T_true = views.T_view_from_camera @ T_true
+    truth = update_between(views.T_view_from_model, T_true, views.K, views.centre)
     parts = []
     for part in (slice(0, 2), slice(2, 3), slice(3, 9)):
         mixed = truth.clone()
         mixed[:, part] = update[:, part]
-        T = apply_update(T_view_from_model, mixed, K, centre)
+        T = apply_update(views.T_view_from_model, mixed, views.K, views.centre)
         parts.append(point_matching_error(T, T_true, surface, diameter=diameter, valid=valid, norm="l1"))
     return torch.stack(parts, dim=-1)
 
@@ -108,24 +100,15 @@ class RefinerTraining(pl.LightningModule):
 
     def batch_loss(self, batch: RefinerBatch) -> RefinerLoss:
         """Loss of B pictures; differentiable w.r.t. the network's parameters."""
-        refiner, index = self.refiner, torch.arange(len(batch.images), device=batch.images.device)
-        weights = batch.images.new_tensor([1.0, self.depth_weight, 1.0])
-        T, valid = batch.T_start, torch.ones_like(batch.mesh_index, dtype=torch.bool)
-        total = batch.images.new_zeros(())
+        refiner, T = self.refiner, batch.T_start
+        weights = T.new_tensor([1.0, self.depth_weight, 1.0])
+        valid = torch.ones_like(batch.pictured.mesh_index, dtype=torch.bool)
+        total = T.new_zeros(())
         for _ in range(self.iterations):
-            views = refiner.look(batch.images, batch.K, T, index, batch.meshes, batch.mesh_index)
+            views = refiner.look(T, batch.pictured)
             update, _ = refiner.predict(views)
             valid = valid & views.valid
-            parts = disentangled_error(
-                views.T_view_from_model,
-                update,
-                views.T_view_from_camera @ batch.T_true,
-                views.K,
-                views.centre,
-                batch.surface,
-                batch.diameter,
-                valid,
-            )
+            parts = disentangled_error(views, update, batch.T_true, batch.surface, batch.diameter, valid)
             total = total + (parts @ weights).sum() / valid.sum().clamp(min=1)
             T = refiner.move(views, update.detach())
         before, after = (

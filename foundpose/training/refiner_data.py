@@ -14,6 +14,7 @@ from torch.utils.data import DataLoader, Dataset, Sampler
 
 from foundpose.geometry import PerspectiveCrop, make_transform
 from foundpose.onboarding import Progress
+from foundpose.refinement import PicturedObjects
 from foundpose.rendering import Mesh, Renderer, RenderOutput
 from foundpose.synthetic import LightVariation, combine_seeds
 from foundpose.training.views import render_crops
@@ -90,22 +91,16 @@ class RefinerBatch(NamedTuple):
     """B pictures with true and perturbed poses.
 
     Attributes:
-        images: (B, 3, H, W) in [0, 1].
-        K: (B, 3, 3) pixels.
+        pictured: one picture for each.
         T_true: (B, 4, 4) ``T_camera_from_model``, mesh units.
         T_start: (B, 4, 4) the perturbed ones.
-        mesh_index: (B,) int64.
-        meshes: all meshes.
         surface: (B, P, 3) points of the surface, mesh units.
         diameter: (B,) mesh units.
     """
 
-    images: Tensor
-    K: Tensor
+    pictured: PicturedObjects
     T_true: Tensor
     T_start: Tensor
-    mesh_index: Tensor
-    meshes: list[Mesh]
     surface: Tensor
     diameter: Tensor
 
@@ -177,12 +172,15 @@ class RefinerPictures(Dataset[RefinerBatch]):
         mesh_index, T_true = self.mesh_index[rows], self.T_true[rows]
         seeds = [combine_seeds(self.seed, 1, k) for k in keys]
         return RefinerBatch(
-            images=self.images[rows].float() / 255.0,
-            K=self.K[rows],
+            pictured=PicturedObjects(
+                self.images[rows].float() / 255.0,
+                self.K[rows],
+                torch.arange(len(rows)),
+                self.meshes,
+                mesh_index,
+            ),
             T_true=T_true,
             T_start=self.perturbation(T_true, self.centre[mesh_index], seeds),
-            mesh_index=mesh_index,
-            meshes=self.meshes,
             surface=self.surface[mesh_index],
             diameter=self.diameter[mesh_index],
         )

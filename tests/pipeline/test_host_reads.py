@@ -28,7 +28,8 @@ MAY_READ = {
     "pipeline/query.py:select_query_patches",
 }
 READS = {"_local_scalar_dense", "nonzero", "masked_select", "equal", "is_nonzero", "_unique2"}
-ON_THE_HOST = {"refinement/refiners.py:alignment_problem"}  # an index that is there already
+# Which crop shows which object is known there already.
+ON_THE_HOST = {f"representation/groups.py:{name}" for name in ("__init__", "<listcomp>")}
 
 
 class HostReads(TorchDispatchMode):

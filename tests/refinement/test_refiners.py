@@ -10,9 +10,9 @@ from foundpose.pnp import RansacPnp
 from foundpose.refinement import (
     FeaturemetricAlignment,
     FeaturemetricRefiner,
+    Observation,
     PoseProposals,
     PoseRefiner,
-    RefinedPoses,
     RefinerChain,
 )
 from foundpose.rendering import CoordinateRenderer
@@ -109,9 +109,11 @@ def test_alone_as_in_a_batch_with_other_objects(views, oracle_blob, oracle_onboa
 class Stubborn(PoseRefiner):
     """Refuses everything."""
 
-    def forward(self, proposals: PoseProposals) -> RefinedPoses:
+    def forward(self, proposals: PoseProposals, observation: Observation) -> PoseProposals:
         nothing = torch.zeros_like(proposals.valid)
-        return RefinedPoses(proposals.T_crop_from_model + 1.0, proposals.score + 7, nothing)
+        return PoseProposals(
+            proposals.T_crop_from_model + 1.0, proposals.score + 7, nothing, proposals.template_index
+        )
 
 
 def test_a_pose_that_cannot_be_refined_stays_as_it_was(views, oracle_blob):
@@ -127,10 +129,10 @@ def test_a_pose_that_cannot_be_refined_stays_as_it_was(views, oracle_blob):
 class Nudge(PoseRefiner):
     """Moves poses by a unit along the optical axis and counts itself in the score."""
 
-    def forward(self, proposals: PoseProposals) -> RefinedPoses:
+    def forward(self, proposals: PoseProposals, observation: Observation) -> PoseProposals:
         T = proposals.T_crop_from_model.clone()
         T[..., 2, 3] += 1.0
-        return RefinedPoses(T, proposals.score + 1, proposals.valid)
+        return proposals._replace(T_crop_from_model=T, score=proposals.score + 1)
 
 
 def test_a_chain_hands_poses_on(views, oracle_blob):

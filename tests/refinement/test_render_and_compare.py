@@ -15,8 +15,15 @@ from foundpose.geometry import (
     project_points,
     transform_points,
 )
-from foundpose.refinement import PoseProposals, RenderAndCompareRefiner, UpdateNetwork
+from foundpose.refinement import (
+    Observation,
+    PicturedObjects,
+    PoseProposals,
+    RenderAndCompareRefiner,
+    UpdateNetwork,
+)
 from foundpose.rendering import RaycastRenderer
+from foundpose.representation import ObjectGroups
 from foundpose.synthetic import procedural_mesh
 from foundpose.training import Perturbation
 from tests.refinement.learned import Constant, Oracle, small_network, stirred_network
@@ -51,31 +58,40 @@ def setting():
     return Setting(mesh, images, T_true, T_start)
 
 
-def refine(refiner, setting, T, rows=slice(None)):
-    images, count = setting.images[rows], len(setting.images[rows])
-    index = torch.arange(count)
-    return refiner.refine(
-        images, K.expand(count, 3, 3), T[rows], index, [setting.mesh], torch.zeros_like(index)
+def pictured(setting, rows=slice(None), meshes=None, mesh_index=None):
+    images = setting.images[rows]
+    index = torch.arange(len(images))
+    return PicturedObjects(
+        images,
+        K.to(images).expand(len(images), 3, 3),
+        index,
+        meshes or [setting.mesh],
+        0 * index if mesh_index is None else mesh_index,
     )
 
 
-def propose(setting, T, valid=None, meshes="own", score=None):
-    """Proposals (4, n) in crop frames that are turned against the camera's."""
+def refine(refiner, setting, T, rows=slice(None)):
+    return refiner.refine(T[rows], pictured(setting, rows))
+
+
+def propose(setting, T, valid=None, meshes="own"):
+    """Proposals (4, n) in crop frames that are turned against the camera's, and what they belong to."""
     n = T.shape[1]
     crops = PerspectiveCrop(96)(
         setting.images, K.expand(4, 3, 3), boxes=torch.tensor([[60.0, 40, 200, 180]]).expand(4, 4)
     )
-    valid = torch.ones(4, n, dtype=torch.bool) if valid is None else valid
-    return PoseProposals(
+    proposals = PoseProposals(
         T_crop_from_model=crops.T_crop_from_camera[:, None] @ T,
-        score=torch.full((4, n), 0.25) if score is None else score,
-        valid=valid,
+        score=torch.full((4, n), 0.25),
+        valid=torch.ones(4, n, dtype=torch.bool) if valid is None else valid,
         template_index=torch.zeros(4, n, dtype=torch.int64),
+    )
+    return proposals, Observation(
         crops=crops,
         features=None,
         grid=PatchGrid(14.0, 6.5, 30),
-        objects=[None],
-        object_index=torch.zeros(4, dtype=torch.int64),
+        query=None,
+        groups=ObjectGroups([None], None, 4, torch.device("cpu")),
         images=setting.images,
         K=K.expand(4, 3, 3),
         image_index=torch.arange(4),
@@ -119,9 +135,8 @@ def test_oracle_reaches_the_truth(setting):
 
 def test_views_are_centred_on_the_object_at_the_current_pose(setting):
     refiner = RenderAndCompareRefiner(nn.Identity(), RaycastRenderer(1), size=64, margin=1.4)
-    index = torch.arange(4)
     for T in (setting.T_start, setting.T_true):
-        views = refiner.look(setting.images, K.expand(4, 3, 3), T, index, [setting.mesh], 0 * index)
+        views = refiner.look(T, pictured(setting))
         middle, _ = project_points(transform_points(views.T_view_from_model, views.centre[:, None]), views.K)
         torch.testing.assert_close(middle[:, 0], torch.full((4, 2), 31.5), rtol=0, atol=2e-2)
         # The whole object is in it, its farther reach at 1 / margin of the half side.
@@ -175,10 +190,10 @@ def test_poses_that_cannot_be_rendered_come_back_as_they_came(setting):
     T[:, 4] = make_transform(torch.eye(3), -setting.mesh.bounds.mean(0))  # around the camera
     valid = torch.ones(4, 6, dtype=torch.bool)
     valid[:, 5] = False
-    proposals = propose(setting, T, valid)
+    proposals, observation = propose(setting, T, valid)
     refiner = RenderAndCompareRefiner(stirred_network(), RaycastRenderer(1), iterations=2, size=64)
     with torch.no_grad():
-        refined = refiner(proposals)
+        refined = refiner(proposals, observation)
         assert refined.valid.tolist() == [[True] + 5 * [False]] * 4
         torch.testing.assert_close(
             refined.T_crop_from_model[:, 1:],
@@ -188,9 +203,9 @@ def test_poses_that_cannot_be_rendered_come_back_as_they_came(setting):
             atol=0,
         )
         assert torch.equal(refined.score, proposals.score)
-        moved = to_camera(proposals.crops, refined.T_crop_from_model)[:, 0]
+        moved = to_camera(observation.crops, refined.T_crop_from_model)[:, 0]
         # The good one is refined as if the others were not there.
-        alone = refiner(propose(setting, T[:, :1]))
+        alone = refiner(*propose(setting, T[:, :1]))
         torch.testing.assert_close(alone.T_crop_from_model[:, 0], refined.T_crop_from_model[:, 0])
         assert torch.isfinite(moved).all()
         # Networks that move a pose where it cannot be, or that say nothing.
@@ -201,10 +216,10 @@ def test_poses_that_cannot_be_rendered_come_back_as_they_came(setting):
             (math.nan, 0.0, 1.0, 1.0, 0, 0, 0, 1, 0),
         ):
             bad = RenderAndCompareRefiner(Constant(*values), RaycastRenderer(1), iterations=2, size=32)
-            refined = bad(propose(setting, T[:, :1]))
+            refined = bad(*propose(setting, T[:, :1]))
             assert not refined.valid.any(), values
-            assert torch.equal(refined.T_crop_from_model, propose(setting, T[:, :1]).T_crop_from_model)
-        nothing = refiner(propose(setting, T, torch.zeros(4, 6, dtype=torch.bool)))
+            assert torch.equal(refined.T_crop_from_model, propose(setting, T[:, :1])[0].T_crop_from_model)
+        nothing = refiner(*propose(setting, T, torch.zeros(4, 6, dtype=torch.bool)))
         assert not nothing.valid.any()
 
 
@@ -212,19 +227,21 @@ def test_score_of_the_network(setting):
     T = setting.T_start[:, None].repeat(1, 2, 1, 1)
     T[0, 1] = torch.nan
     network = Constant(0, 0, 1.0, 1, 0, 0, 0, 1, 0, 2.0)
-    refined = RenderAndCompareRefiner(network, RaycastRenderer(1), iterations=1, size=32)(propose(setting, T))
+    refined = RenderAndCompareRefiner(network, RaycastRenderer(1), iterations=1, size=32)(
+        *propose(setting, T)
+    )
     expected = torch.full((4, 2), 1 / (1 + math.exp(-2.0)))
     expected[0, 1] = 0.0
     torch.testing.assert_close(refined.score.detach(), expected)
     own = RenderAndCompareRefiner(small_network(), RaycastRenderer(1), iterations=1, size=32)
-    assert torch.equal(own(propose(setting, T)).score, torch.full((4, 2), 0.25))
+    assert torch.equal(own(*propose(setting, T)).score, torch.full((4, 2), 0.25))
 
 
 def test_gradients_to_parameters_and_picture(setting):
     refiner = RenderAndCompareRefiner(stirred_network(), RaycastRenderer(1), iterations=2, size=64)
     images = setting.images.clone().requires_grad_()
-    proposals = propose(setting, setting.T_start[:, None])._replace(images=images)
-    refined = refiner(proposals)
+    proposals, observation = propose(setting, setting.T_start[:, None])
+    refined = refiner(proposals, observation._replace(images=images))
     (refined.T_crop_from_model[..., :3, :] * torch.tensor([1.0, 1, 1, 0.01])).square().sum().backward()
     for name, p in refiner.network.named_parameters():
         assert torch.isfinite(p.grad).all(), name
@@ -239,15 +256,7 @@ def test_gradient_of_one_iteration_against_finite_differences(setting):
     double = setting._replace(images=setting.images.double())
 
     def value():
-        index = torch.arange(4)
-        found = refiner.refine(
-            double.images,
-            K.double().expand(4, 3, 3),
-            setting.T_start.double(),
-            index,
-            [setting.mesh],
-            0 * index,
-        )
+        found = refiner.refine(setting.T_start.double(), pictured(double))
         return (found.T_camera_from_model[:, :3] * torch.linspace(-1, 1, 12).double().reshape(3, 4)).sum()
 
     value().backward()
@@ -265,15 +274,12 @@ def test_gradient_of_one_iteration_against_finite_differences(setting):
 
 def test_several_objects_in_one_batch(setting):
     other = procedural_mesh(6, subdivisions=3)
-    index = torch.arange(4)
     T = setting.T_start.clone()
     T[1] = make_transform(torch.eye(3), torch.tensor([0.0, 0.0, 500.0]))
     refiner = RenderAndCompareRefiner(nn.Identity(), RaycastRenderer(1), size=32)
-    mixed = refiner.look(
-        setting.images, K.expand(4, 3, 3), T, index, [setting.mesh, other], torch.tensor([0, 1, 0, 0])
-    )
-    first = refiner.look(setting.images, K.expand(4, 3, 3), T, index, [setting.mesh], 0 * index)
-    second = refiner.look(setting.images, K.expand(4, 3, 3), T, index, [other], 0 * index)
+    both = pictured(setting, meshes=[setting.mesh, other], mesh_index=torch.tensor([0, 1, 0, 0]))
+    mixed, first = refiner.look(T, both), refiner.look(T, pictured(setting))
+    second = refiner.look(T, pictured(setting, meshes=[other]))
     for field in ("crops", "renderings", "K", "centre"):
         expected = getattr(first, field).clone()
         expected[1] = getattr(second, field)[1]
@@ -292,8 +298,8 @@ def test_bad_arguments(setting):
     refiner = RenderAndCompareRefiner(Constant(1.0, 2.0), renderer, size=32)
     T = setting.T_start[:, None]
     with pytest.raises(ValueError, match=r"\(M, 9\) or \(M, 10\) for M = 4 pictures, got \(4, 2\)"):
-        refiner(propose(setting, T))
+        refiner(*propose(setting, T))
     with pytest.raises(ValueError, match=r"pass their meshes to FoundPose\.forward"):
-        refiner(propose(setting, T, meshes=None))
+        refiner(*propose(setting, T, meshes=None))
     with pytest.raises(ValueError, match="got 2 meshes for 1 objects"):
-        refiner(propose(setting, T, meshes=[setting.mesh] * 2))
+        refiner(*propose(setting, T, meshes=[setting.mesh] * 2))

@@ -95,18 +95,18 @@ def test_perturbations_have_the_given_size():
 def test_pictures_show_the_objects_at_the_true_poses(pictures, bodies):
     assert len(pictures) == 12
     batch = pictures.__getitems__([2, 9])
-    assert batch.mesh_index.tolist() == [0, 1]
+    assert batch.pictured.mesh_index.tolist() == [0, 1]
     renderer = RaycastRenderer(1)
     dark = PictureSettings(pictures_per_mesh=1, size=96, occlusion=False)
     for mesh in bodies:
         plain = RefinerPictures([mesh], dark, Perturbation(), renderer, seed=1)[0]
-        render = renderer(mesh, plain.T_true, plain.K, (96, 96))
+        render = renderer(mesh, plain.T_true, plain.pictured.K, (96, 96))
         inside = render.mask
-        gray, shown = (x.mean(1)[inside] for x in (plain.images, render.rgb))
+        gray, shown = (x.mean(1)[inside] for x in (plain.pictured.images, render.rgb))
         assert torch.corrcoef(torch.stack([gray, shown]))[0, 1] > 0.8
     # Passing the end brings the same pictures and truths with other perturbations.
     later = pictures.__getitems__([14, 21])
-    assert torch.equal(later.images, batch.images)
+    assert torch.equal(later.pictured.images, batch.pictured.images)
     assert torch.equal(later.T_true, batch.T_true)
     assert not torch.allclose(later.T_start, batch.T_start, atol=1.0)
     assert torch.equal(pictures[9].T_start[0], batch.T_start[1])
@@ -126,25 +126,23 @@ def test_order_depends_on_seed_and_epoch():
 def test_disentangled_error_by_hand(pictures):
     batch = pictures.__getitems__([0, 7])
     refiner = new_training().refiner
-    views = refiner.look(
-        batch.images, batch.K, batch.T_start, torch.arange(2), batch.meshes, batch.mesh_index
-    )
+    views = refiner.look(batch.T_start, batch.pictured)
     truth = views.T_view_from_camera @ batch.T_true
     update = update_between(views.T_view_from_model, truth, views.K, views.centre)
-    common = (truth, views.K, views.centre, batch.surface, batch.diameter, torch.tensor([True, True]))
-    exact = disentangled_error(views.T_view_from_model, update, *common)
+    common = (batch.T_true, batch.surface, batch.diameter, torch.tensor([True, True]))
+    exact = disentangled_error(views, update, *common)
     torch.testing.assert_close(exact, torch.zeros(2, 3), rtol=0, atol=1e-4)
     # A wrong depth shows in the second part alone, as every point's shift along the ray.
     wrong = update.clone()
     wrong[:, 2] *= 1.1
-    parts = disentangled_error(views.T_view_from_model, wrong, *common)
+    parts = disentangled_error(views, wrong, *common)
     centre = transform_points(truth, views.centre[:, None])[:, 0]
     torch.testing.assert_close(parts[:, 1], 0.1 * centre.abs().sum(1) / batch.diameter, rtol=1e-3, atol=1e-5)
     assert parts[:, [0, 2]].abs().max() < 1e-4
     # A wrong rotation shows in the third alone, and turns about the centre.
     wrong = update.clone()
     wrong[:, 3:] = torch.tensor([1.0, 0, 0, 0, 1, 0])
-    parts = disentangled_error(views.T_view_from_model, wrong, *common)
+    parts = disentangled_error(views, wrong, *common)
     assert parts[:, :2].abs().max() < 1e-4
     turned = apply_update(views.T_view_from_model, wrong, views.K, views.centre)
     torch.testing.assert_close(
@@ -152,7 +150,7 @@ def test_disentangled_error_by_hand(pictures):
     )
     gap = (transform_points(turned, batch.surface) - transform_points(truth, batch.surface)).abs().sum(-1)
     torch.testing.assert_close(parts[:, 2], gap.mean(1) / batch.diameter, rtol=1e-3, atol=1e-5)
-    none = disentangled_error(views.T_view_from_model, wrong, *common[:-1], torch.tensor([True, False]))
+    none = disentangled_error(views, wrong, *common[:-1], torch.tensor([True, False]))
     assert (none[1] == 0).all()
 
 
@@ -237,7 +235,7 @@ def test_one_renderer_for_each_mesh(bodies, pictures):
     batch = pictures.__getitems__([0, 6])
     many, one = RendererPerMesh(RaycastRenderer(2, ambient=0.3)), RaycastRenderer(2, ambient=0.3)
     for i, mesh in enumerate(bodies):
-        a, b = (r(mesh, batch.T_true[i : i + 1], batch.K[i : i + 1], (48, 48)) for r in (many, one))
+        a, b = (r(mesh, batch.T_true[i : i + 1], batch.pictured.K[i : i + 1], (48, 48)) for r in (many, one))
         assert torch.equal(a.rgb, b.rgb)
         assert a.mask.any()
 

@@ -220,20 +220,14 @@ def test_settings_that_scipy_does_not_know(stages):
 
 def test_scipy_minimises_our_cost(stages, workload):
     """From a pose a little off the optimum, both come to the same minimum of the cost as ours measures it."""
-    proposals = next(
-        task.call.args[0] for task in stage_tasks(stages, workload, {}, "s") if task.name == REFINE_ONE
+    proposals, observation = next(
+        task.call.args for task in stage_tasks(stages, workload, {}, "s") if task.name == REFINE_ONE
     )
-    problem = alignment_problem(proposals)
+    problem = alignment_problem(proposals, observation)
     alignment = FeaturemetricAlignment(max_iterations=100, tolerance=1e-9)
     with torch.no_grad():
         optimum = alignment(proposals.T_crop_from_model[:, 0], problem).T_crop_from_model[:1]
-        one = problem._replace(
-            map_index=problem.map_index[:1],
-            K=problem.K[:1],
-            descriptors=problem.descriptors[:1],
-            points_model=problem.points_model[:1],
-            valid=problem.valid[:1],
-        )
+        one = problem.take(slice(1))
         start = turned(optimum, problem.points_model[0, problem.valid[0]], degrees=0.5)
         ours = alignment(start, one)
         theirs = featuremetric_least_squares(start[0], one, alignment)

@@ -4,9 +4,10 @@ from collections.abc import Callable, Sequence
 from typing import Any, TypeVar, cast
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from foundpose.representation import ObjectRepresentation
+from foundpose.representation.object_representation import ObjectRepresentation
 from foundpose.utils.devices import indices_on
 
 Fields = TypeVar("Fields", bound=tuple[Any, ...])
@@ -33,12 +34,18 @@ class ObjectGroups:
         count: int,
         device: torch.device,
     ) -> None:
-        if object_index is None and len(objects) != 1:
-            raise ValueError(f"object_index (B,) is needed to tell {len(objects)} objects apart")
         if object_index is None:
-            labels, rows = torch.zeros(count, dtype=torch.int64), [torch.arange(count)]
-        else:
-            labels, rows = _members(object_index, count, len(objects))
+            if len(objects) != 1:
+                raise ValueError(f"object_index (B,) is needed to tell {len(objects)} objects apart")
+            object_index = torch.zeros(count, dtype=torch.int64)
+        if object_index.shape != (count,) or object_index.is_floating_point():
+            raise ValueError(
+                f"object_index must be ({count},) integers, got {tuple(object_index.shape)} {object_index.dtype}"
+            )
+        labels = object_index.cpu().long()
+        if count and (int(labels.min()) < 0 or int(labels.max()) >= len(objects)):
+            raise ValueError(f"object_index must lie in [0, {len(objects)}), got {labels.tolist()}")
+        rows = [torch.nonzero(labels == i).flatten() for i in range(len(objects))]
         self.objects = list(objects)
         self.object_index = labels
         self._groups = [
@@ -52,36 +59,25 @@ class ObjectGroups:
         """Call a function with each object that has crops and their indices; join what it says of them.
 
         Returns:
-            Tensors, or a named tuple of tensors, in the order of the batch.
+            Tensors, or a named tuple of tensors, in the order of the batch; zeros fill what is longer for another
+            object.
         """
         parts = [function(obj, rows) for obj, rows in self._groups]
 
         def join(fields: list[Tensor]) -> Tensor:
-            return torch.cat(fields)[self._back]
+            return torch.cat(_same_size(fields))[self._back]
 
         if isinstance(parts[0], Tensor):
             return cast(Part, join(cast(list[Tensor], parts)))
-        return cast(Part, combine(cast(list[tuple[Any, ...]], parts), join))
-
-
-def _members(object_index: Tensor, count: int, num_objects: int) -> tuple[Tensor, list[Tensor]]:
-    """The objects' numbers (B,) on the host, and the crops of each object."""
-    if object_index.shape != (count,) or object_index.is_floating_point():
-        raise ValueError(
-            f"object_index must be ({count},) integers, got {tuple(object_index.shape)} {object_index.dtype}"
-        )
-    labels = object_index.cpu().long()
-    if count and (int(labels.min()) < 0 or int(labels.max()) >= num_objects):
-        raise ValueError(f"object_index must lie in [0, {num_objects}), got {labels.tolist()}")
-    return labels, [torch.nonzero(labels == i).flatten() for i in range(num_objects)]
+        return cast(Part, _combine(cast(list[tuple[Any, ...]], parts), join))
 
 
 def take_rows(part: Fields, rows: Tensor) -> Fields:
     """Some rows of a named tuple of tensors."""
-    return combine([part], lambda fields: fields[0][rows])
+    return _combine([part], lambda fields: fields[0][rows])
 
 
-def combine(parts: Sequence[Fields], combine: Callable[[list[Tensor]], Tensor]) -> Fields:
+def _combine(parts: Sequence[Fields], combine: Callable[[list[Tensor]], Tensor]) -> Fields:
     """Combine named tuples of tensors field by field; a field that is None stays None."""
     fields = [
         None if any(tensor is None for tensor in field) else combine(list(field))
@@ -89,3 +85,15 @@ def combine(parts: Sequence[Fields], combine: Callable[[list[Tensor]], Tensor]) 
     ]
     make = cast(Callable[..., Fields], type(parts[0]))
     return make(*fields)
+
+
+def _same_size(tensors: list[Tensor]) -> list[Tensor]:
+    """Tensors padded with zeros to the largest size of each dimension but the first."""
+    sizes = [tensor.shape[1:] for tensor in tensors]
+    most = [max(size) for size in zip(*sizes, strict=True)]
+    return [
+        F.pad(x, [n for k, m in zip(size[::-1], most[::-1], strict=True) for n in (0, m - k)])
+        if list(size) != most
+        else x
+        for x, size in zip(tensors, sizes, strict=True)
+    ]
