@@ -27,7 +27,6 @@ from foundpose.training import (
     RefinerDataModule,
     RefinerPictures,
     RefinerTraining,
-    RendererPerMesh,
     compare,
     evaluate_refiner,
     summarize,
@@ -101,7 +100,6 @@ def train(
     output: Path,
 ) -> None:
     """Train the refiner's network in place; goes on from the last checkpoint in the folder."""
-    refiner.renderer = RendererPerMesh(refiner.renderer)
     data: RefinerDataModule = instantiate(
         cfg.data_module,
         meshes=meshes,

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from foundpose.bop.vsd import BOP_DELTA, vsd
 from foundpose.rendering import Mesh
-from foundpose.rendering.base import View, make_view
+from foundpose.rendering.base import View, make_view, surface_depth
 from foundpose.rendering.raycast import RayScene
 from foundpose.rendering.shading import Surface
 
@@ -55,12 +55,7 @@ class DepthObject:
         depth = np.zeros(max(bottom - top, 0) * max(right - left, 0), np.float32)
         if depth.size:
             hits = self._scene.trace(view, (0.0, 0.0))
-            z = (self._surface.vertices @ view.linear[2] + view.translation[2])[
-                self._surface.faces[hits.face]
-            ]
-            # Differences, as float32 weights add up to 1 only within 1e-7 of what may be a large distance.
-            w = hits.weights.astype(np.float64)
-            depth[hits.pixel] = z[:, 0] + w[:, 1] * (z[:, 1] - z[:, 0]) + w[:, 2] * (z[:, 2] - z[:, 0])
+            depth[hits.pixel] = surface_depth(self._surface, view, hits)
         return depth.reshape(max(bottom - top, 0), max(right - left, 0))
 
 

@@ -1,9 +1,9 @@
 """The renderer interface, and what every renderer does the same way."""
 
 from abc import abstractmethod
-from collections import OrderedDict
 from collections.abc import Callable
-from typing import Any, Generic, NamedTuple, TypeVar
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -11,10 +11,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from foundpose.rendering.mesh import Mesh
-from foundpose.rendering.shading import AMBIENT, Array64, Hits, Surface, interpolate, light
+from foundpose.rendering.shading import AMBIENT, Array64, Hits, Surface, interpolate, light, surface_of
 from foundpose.utils.settings import Configured, Setting
-
-_T = TypeVar("_T")
 
 
 class RenderOutput(NamedTuple):
@@ -68,30 +66,8 @@ class View(NamedTuple):
         return columns, rows, K_inv @ np.array([middle_u + offset[0], middle_v + offset[1], 1.0])
 
 
-class MeshCache(Generic[_T]):
-    """Keeps what was built for the last meshes; a copied or unpickled cache is empty.
-
-    Args:
-        build: makes the entry of a mesh.
-        capacity: number of meshes kept.
-    """
-
-    def __init__(self, build: Callable[[Mesh], _T], capacity: int = 4) -> None:
-        self.build = build
-        self.capacity = capacity
-        self._entries: OrderedDict[str, _T] = OrderedDict()
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self.build, self.capacity)
-
-    def __call__(self, mesh: Mesh) -> _T:
-        """The entry of a mesh, built on first use."""
-        if mesh.checksum not in self._entries:
-            self._entries[mesh.checksum] = self.build(mesh)
-            while len(self._entries) > self.capacity:
-                self._entries.popitem(last=False)
-        self._entries.move_to_end(mesh.checksum)
-        return self._entries[mesh.checksum]
+Trace = Callable[[View, tuple[float, float]], Hits]
+"""Finds what the pixels of a view's window, moved by an offset (u, v) in pixels, see first."""
 
 
 class Renderer(Configured):
@@ -107,12 +83,14 @@ class Renderer(Configured):
 
     Attributes:
         bits: 8 or 16, to which onboarding rounds the colours of templates. A camera has 8.
+        in_threads: whether views may be traced on several threads.
 
     Raises:
         ValueError: an argument out of range.
     """
 
     bits: int = 8
+    in_threads: bool = False
 
     def __init__(self, supersampling: int = 2, ambient: float = AMBIENT) -> None:
         super().__init__()
@@ -122,7 +100,6 @@ class Renderer(Configured):
             raise ValueError(f"ambient must lie in [0, 1], got {ambient}")
         self.supersampling = int(supersampling)
         self.ambient = float(ambient)
-        self._surfaces: MeshCache[Surface] = MeshCache(Surface)
 
     def forward(
         self, mesh: Mesh, T_camera_from_model: Tensor, K: Tensor, size: tuple[int, int]
@@ -148,7 +125,7 @@ class Renderer(Configured):
         """
         _check_inputs(T_camera_from_model, K, size)
         T = T_camera_from_model.detach()
-        surface = self._surfaces(mesh)
+        surface = surface_of(mesh)
         T_array = T.to("cpu", torch.float64).numpy()
         K_array = K.detach().to("cpu", torch.float64).expand(len(T), 3, 3).numpy()
         views = [make_view(surface, *camera, size) for camera in zip(T_array, K_array, strict=True)]
@@ -161,7 +138,16 @@ class Renderer(Configured):
         )
         arrays = [tensor.numpy() for tensor in output]
         jobs = [(view, [a[i] for a in arrays]) for i, view in enumerate(views) if not is_empty(view)]
-        self._render_views(mesh, surface, jobs)
+        if jobs:
+            trace = self._tracer(mesh, size)
+            # NumPy releases the interpreter lock, so threads share the views without copies.
+            count = min(torch.get_num_threads(), len(jobs)) if self.in_threads else 1
+            if count > 1:
+                with ThreadPoolExecutor(count) as pool:
+                    list(pool.map(lambda job: self._render_view(surface, trace, *job), jobs))
+            else:
+                for job in jobs:
+                    self._render_view(surface, trace, *job)
         return RenderOutput(*(tensor.to(T.device) for tensor in output))
 
     def settings(self) -> dict[str, Setting]:
@@ -169,26 +155,11 @@ class Renderer(Configured):
         return {"supersampling": self.supersampling, "ambient": self.ambient}
 
     @abstractmethod
-    def _render_views(
-        self, mesh: Mesh, surface: Surface, jobs: list[tuple[View, list[NDArray[Any]]]]
-    ) -> None:
-        """Call ``_render_view`` for every job."""
+    def _tracer(self, mesh: Mesh, size: tuple[int, int]) -> Trace:
+        """What finds the surface that a view's pixels see, for images (height, width)."""
 
-    def _render_view(
-        self,
-        surface: Surface,
-        view: View,
-        trace: Callable[[tuple[float, float]], Hits],
-        images: list[NDArray[Any]],
-    ) -> None:
-        """Fill the images (3, H, W), (H, W), (H, W), (3, H, W) of one view.
-
-        Args:
-            surface: attributes of the mesh.
-            view: the camera.
-            trace: finds what the window's pixels, moved by an offset in pixels, see.
-            images: zeros to be filled.
-        """
+    def _render_view(self, surface: Surface, trace: Trace, view: View, images: list[NDArray[Any]]) -> None:
+        """Fill images of zeros (3, H, W), (H, W), (H, W), (3, H, W) with one view."""
         left, top, right, bottom = view.window
         rgb, depth, mask, normals = (image[..., top:bottom, left:right] for image in images)
         n = self.supersampling
@@ -200,37 +171,31 @@ class Renderer(Configured):
         total = np.zeros((mask.size, 3), np.float32)
         centre = None
         for offset in [(du, dv) for dv in steps for du in steps]:
-            hits = trace(offset)
+            hits = trace(view, offset)
             model_normals, albedo = surface.normals_and_albedo(hits, spacing)
             total[hits.pixel] += light(albedo, model_normals, camera_axis, self.ambient)
             if offset == (0.0, 0.0):
                 centre = hits
         rgb[...] = (total / n**2).clip(0.0, 1.0).T.reshape(rgb.shape)
-        centre = centre if centre is not None else trace((0.0, 0.0))
-        write_geometry(surface, view, centre, depth, mask, normals)
+        centre = centre if centre is not None else trace(view, (0.0, 0.0))
+        at, column = np.divmod(centre.pixel, mask.shape[1])
+        depth[at, column] = surface_depth(surface, view, centre)
+        mask[at, column] = True
+        normal = interpolate(surface.corners, centre)[:, :3].astype(np.float64) @ np.linalg.inv(view.linear)
+        columns, rows, middle = view.pixel_rays((0.0, 0.0))
+        away = np.einsum("mi,mi->m", normal, columns[column] + rows[at] + middle) > 0.0
+        normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-12)[:, None]
+        normal *= np.where(away, -1.0, 1.0)[:, None]
+        normals[:, at, column] = normal.T
 
 
-def write_geometry(
-    surface: Surface,
-    view: View,
-    hits: Hits,
-    depth: NDArray[Any],
-    mask: NDArray[np.bool_],
-    normals: NDArray[Any],
-) -> None:
-    """Write depth, mask and normals of the pixel centres into the window's part of the images."""
-    row, column = np.divmod(hits.pixel, mask.shape[1])
-    vertex_depth = surface.vertices @ view.linear[2] + view.translation[2]
-    z = vertex_depth[surface.faces[hits.face]]
+def surface_depth(surface: Surface, view: View, hits: Hits) -> Array64:
+    """z (M,) in the camera frame where samples meet the surface."""
+    z = (surface.vertices @ view.linear[2] + view.translation[2])[surface.faces[hits.face]]
     # Differences, as float32 weights add up to 1 only within 1e-7 of what may be a large distance.
     w = hits.weights.astype(np.float64)
-    depth[row, column] = z[:, 0] + w[:, 1] * (z[:, 1] - z[:, 0]) + w[:, 2] * (z[:, 2] - z[:, 0])
-    mask[row, column] = True
-    n = interpolate(surface.corners, hits)[:, :3].astype(np.float64) @ np.linalg.inv(view.linear)
-    columns, rows, middle = view.pixel_rays((0.0, 0.0))
-    away = np.einsum("mi,mi->m", n, columns[column] + rows[row] + middle) > 0.0
-    n /= np.maximum(np.linalg.norm(n, axis=1), 1e-12)[:, None] * np.where(away, -1.0, 1.0)[:, None]
-    normals[:, row, column] = n.T
+    depth: Array64 = z[:, 0] + w[:, 1] * (z[:, 1] - z[:, 0]) + w[:, 2] * (z[:, 2] - z[:, 0])
+    return depth
 
 
 def make_view(surface: Surface, T: Array64, K: Array64, size: tuple[int, int]) -> View:

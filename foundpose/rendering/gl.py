@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from foundpose.rendering.base import Renderer, View
+from foundpose.rendering.base import Renderer, Trace, View
 from foundpose.rendering.mesh import Mesh
-from foundpose.rendering.shading import AMBIENT, Hits, Surface
+from foundpose.rendering.shading import AMBIENT, Hits, Surface, surface_of
 
 _SHADERS = Path(__file__).parent / "shaders"
 _GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -75,6 +75,8 @@ class FaceRasterizer:
     def faces_seen(self, view: View, offset: tuple[float, float]) -> NDArray[np.int64]:
         """(H, W) face at each pixel centre moved by ``offset`` (u, v), −1 on the background."""
         K, camera = view.K, self.camera
+        if K[0, 1] != 0.0 or K[1, 0] != 0.0:
+            raise ValueError("PyrenderRenderer takes intrinsics without skew; RaycastRenderer takes any")
         camera.fx, camera.fy = K[0, 0], K[1, 1]
         # OpenGL counts from the corner of the image, we from the centre of the first pixel.
         camera.cx, camera.cy = K[0, 2] + 0.5 - offset[0], K[1, 2] + 0.5 - offset[1]
@@ -124,19 +126,11 @@ class PyrenderRenderer(Renderer):
         # A GL context belongs to its process and cannot be copied.
         return {**self.__dict__, "_rasterizer": None}
 
-    def _render_views(
-        self, mesh: Mesh, surface: Surface, jobs: list[tuple[View, list[NDArray[Any]]]]
-    ) -> None:
-        if not jobs:
-            return
-        if any(view.K[0, 1] != 0.0 or view.K[1, 0] != 0.0 for view, _ in jobs):
-            raise ValueError("PyrenderRenderer takes intrinsics without skew; RaycastRenderer takes any")
+    def _tracer(self, mesh: Mesh, size: tuple[int, int]) -> Trace:
         if self._rasterizer is None:
-            self._rasterizer = FaceRasterizer(jobs[0][0].size)
-        rasterizer = self._rasterizer
-        rasterizer.set_mesh(mesh)
-        for view, images in jobs:
-            self._render_view(surface, view, partial(rasterizer.trace, surface, view), images)
+            self._rasterizer = FaceRasterizer(size)
+        self._rasterizer.set_mesh(mesh)
+        return partial(self._rasterizer.trace, surface_of(mesh))
 
 
 def barycentric(

@@ -2,9 +2,12 @@
 
 import hashlib
 import warnings
+from collections.abc import Callable
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
+from typing import TypeVar
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -15,6 +18,8 @@ from torch import Tensor
 from foundpose.rendering.mesh_io import MeshArrays, MeshError, read_mesh_file
 
 __all__ = ["Mesh", "MeshError", "load_mesh", "warn_if_scale_implausible"]
+
+T = TypeVar("T")
 
 _PLAUSIBLE_DIAMETERS = (1e-3, 1e5)
 _PLAUSIBLE_DISTANCES = (0.05, 500.0)  # camera distance in object diameters
@@ -98,23 +103,25 @@ class Mesh:
     def diameter(self) -> float:
         """Largest distance between two vertices, mesh units."""
         hull = self.hull_vertices.double()
-        hull = hull - (hull.amin(0) + hull.amax(0)) / 2
-        radius, order = torch.linalg.vector_norm(hull, dim=1).sort(descending=True)
-        hull = hull[order]
-        # The farthest from the farthest is a good start, and only points with r_i + r_j above it can do better.
-        tip, best = hull[0], 0.0
-        for _ in range(3):
-            distance = (hull - tip).square().sum(1)
-            best, tip = max(best, float(distance.max().sqrt())), hull[distance.argmax()]
-        for first in range(0, len(hull), 256):
-            if 2 * radius[first] <= best:
-                break
-            chunk, others = hull[first : first + 256], hull[radius >= best - radius[first]]
-            # Differences, not cdist's dot products, which lose digits.
-            squared = sum((chunk[:, k, None] - others[None, :, k]).square() for k in range(3))
-            assert isinstance(squared, Tensor)
-            best = max(best, float(squared.max().sqrt()))
-        return best
+        radius = torch.linalg.vector_norm(hull - (hull.amin(0) + hull.amax(0)) / 2, dim=1)
+        # The ends of the longest diagonal lie at least this far out.
+        some = float(torch.linalg.vector_norm(hull - hull[radius.argmax()], dim=1).max())
+        ends = hull[radius >= (some - radius.max()) * (1.0 - 1e-12)]
+        # Differences, not dot products, which lose digits.
+        exact = "donot_use_mm_for_euclid_dist"
+        return max(float(torch.cdist(part, ends, compute_mode=exact).max()) for part in ends.split(256))
+
+
+def once_per_mesh(build: Callable[[Mesh], T]) -> Callable[[Mesh], T]:
+    """A function that builds something of a mesh on first use and keeps it for as long as the mesh lives."""
+    kept: WeakKeyDictionary[Mesh, T] = WeakKeyDictionary()
+
+    def of(mesh: Mesh) -> T:
+        if mesh not in kept:
+            kept[mesh] = build(mesh)
+        return kept[mesh]
+
+    return of
 
 
 def load_mesh(path: str | PathLike[str]) -> Mesh:

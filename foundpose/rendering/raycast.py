@@ -1,18 +1,13 @@
 """Ray casting on the CPU with Embree: needs no OpenGL."""
 
-from concurrent.futures import ThreadPoolExecutor
-from functools import partial
-from typing import Any
-
 import numpy as np
-import torch
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
-from foundpose.rendering.base import MeshCache, Renderer, View
-from foundpose.rendering.mesh import Mesh
-from foundpose.rendering.shading import AMBIENT, Hits, Surface
+from foundpose.rendering.base import Renderer, Trace, View
+from foundpose.rendering.mesh import Mesh, once_per_mesh
+from foundpose.rendering.shading import Hits
 
 
 class RayScene:
@@ -53,6 +48,10 @@ class RayScene:
         return Hits(pixel, found["primID"][pixel], np.stack([1.0 - u - v, u, v], axis=1))
 
 
+ray_scene_of = once_per_mesh(RayScene)
+"""A mesh's :class:`RayScene`."""
+
+
 class RaycastRenderer(Renderer):
     """Casts rays with Embree on the CPU's cores (as many threads as ``torch.get_num_threads()``).
 
@@ -61,22 +60,10 @@ class RaycastRenderer(Renderer):
         ambient: share of ambient light in [0, 1]; the rest shines along the camera's axis.
     """
 
-    def __init__(self, supersampling: int = 2, ambient: float = AMBIENT) -> None:
-        super().__init__(supersampling, ambient)
-        self._scenes: MeshCache[RayScene] = MeshCache(RayScene)
+    in_threads = True
 
-    def _render_views(
-        self, mesh: Mesh, surface: Surface, jobs: list[tuple[View, list[NDArray[Any]]]]
-    ) -> None:
-        scene = self._scenes(mesh)
-
-        def render(job: tuple[View, list[NDArray[Any]]]) -> None:
-            view, images = job
-            self._render_view(surface, view, partial(scene.trace, view), images)
-
-        # Embree and NumPy release the interpreter lock, so threads share the views without copies.
-        with ThreadPoolExecutor(max(1, min(torch.get_num_threads(), len(jobs)))) as pool:
-            list(pool.map(render, jobs))
+    def _tracer(self, mesh: Mesh, size: tuple[int, int]) -> Trace:
+        return ray_scene_of(mesh).trace
 
 
 def _outer_sum(columns: NDArray[np.float64], rows: NDArray[np.float64]) -> NDArray[np.float32]:

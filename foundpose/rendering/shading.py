@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
-from foundpose.rendering.mesh import Mesh
+from foundpose.rendering.mesh import Mesh, once_per_mesh
 from foundpose.rendering.mesh_io import PLAIN_ALBEDO
 
 AMBIENT = 0.4
@@ -88,6 +88,10 @@ class Surface:
             texels = sample_texture(self.pyramid[min(level, len(self.pyramid) - 1)], values[:, 3:5])
             albedo = texels * albedo if self.has_colors else texels
         return values[:, :3], albedo
+
+
+surface_of = once_per_mesh(Surface)
+"""A mesh's :class:`Surface`."""
 
 
 def interpolate(corners: NDArray[np.floating], hits: Hits) -> NDArray[np.floating]:

@@ -16,7 +16,6 @@ from foundpose.training.refiner_data import (
     RefinerBatch,
     RefinerDataModule,
     RefinerPictures,
-    RendererPerMesh,
 )
 from foundpose.training.views import (
     TemplateViews,
@@ -44,7 +43,6 @@ __all__ = [
     "RefinerLoss",
     "RefinerPictures",
     "RefinerTraining",
-    "RendererPerMesh",
     "TemplateViews",
     "TrueCrops",
     "compare",

@@ -67,7 +67,7 @@ class RefinerTraining(pl.LightningModule):
     A score that the network may give is not trained.
 
     Args:
-        refiner: what is trained; its renderer should be a :class:`RendererPerMesh` for more than a few meshes.
+        refiner: what is trained.
         iterations: updates for each picture, each with its loss.
         learning_rate: of AdamW at the start; falls to zero over the epochs of the trainer as a cosine.
         weight_decay: of matrices (decoupled).

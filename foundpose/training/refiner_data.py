@@ -1,6 +1,5 @@
 """Pictures of objects with perturbed poses: what a learned refiner is trained and measured on."""
 
-import copy
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ from torch.utils.data import DataLoader, Dataset, Sampler
 from foundpose.geometry import PerspectiveCrop, make_transform
 from foundpose.onboarding import Progress
 from foundpose.refinement import PicturedObjects
-from foundpose.rendering import Mesh, Renderer, RenderOutput
+from foundpose.rendering import Mesh, Renderer
 from foundpose.synthetic import LightVariation, combine_seeds
 from foundpose.training.views import render_crops
 
@@ -288,32 +287,6 @@ class RefinerDataModule(pl.LightningDataModule):
         if self.validation is None:
             return []
         return [DataLoader(self.validation, self.batch_size, collate_fn=_as_it_is)]
-
-
-class RendererPerMesh(Renderer):
-    """Renders as another renderer does, with a copy of it for each mesh, so that none sets up a mesh twice.
-
-    Renderers keep what they built for the last few meshes; training goes round more.
-
-    Args:
-        renderer: what to copy.
-    """
-
-    def __init__(self, renderer: Renderer) -> None:
-        super().__init__(renderer.supersampling, renderer.ambient)
-        self._copies: dict[str, Renderer] = {}
-        self._original = [renderer]  # no submodule
-
-    def forward(
-        self, mesh: Mesh, T_camera_from_model: Tensor, K: Tensor, size: tuple[int, int]
-    ) -> RenderOutput:
-        """As the other renderer's."""
-        if mesh.checksum not in self._copies:
-            self._copies[mesh.checksum] = copy.deepcopy(self._original[0])
-        return self._copies[mesh.checksum](mesh, T_camera_from_model, K, size)
-
-    def _render_views(self, *arguments: Any) -> None:
-        raise AssertionError("the copies render")
 
 
 def _transform(T: Tensor, points: Tensor) -> Tensor:

@@ -24,7 +24,6 @@ from foundpose.training import (
     RefinerDataModule,
     RefinerPictures,
     RefinerTraining,
-    RendererPerMesh,
     compare,
     disentangled_error,
     evaluate_refiner,
@@ -44,7 +43,7 @@ def pictures(bodies):
 
 def new_training(iterations=1, **changes):
     network = UpdateNetwork(width=8, grid=8, reach=2, hidden=32)
-    refiner = RenderAndCompareRefiner(network, RendererPerMesh(RaycastRenderer(1)), iterations=2, size=32)
+    refiner = RenderAndCompareRefiner(network, RaycastRenderer(1), iterations=2, size=32)
     return RefinerTraining(refiner, iterations, **changes)
 
 
@@ -229,15 +228,6 @@ def test_errors_and_their_summary(pictures):
     assert 0 < summary["median_rotation_standard_error"] < float(before.rotation.std())
     with pytest.raises(ValueError, match="12 and 3 poses"):
         compare(before, PoseErrors(*(x[:3] for x in half)))
-
-
-def test_one_renderer_for_each_mesh(bodies, pictures):
-    batch = pictures.__getitems__([0, 6])
-    many, one = RendererPerMesh(RaycastRenderer(2, ambient=0.3)), RaycastRenderer(2, ambient=0.3)
-    for i, mesh in enumerate(bodies):
-        a, b = (r(mesh, batch.T_true[i : i + 1], batch.pictured.K[i : i + 1], (48, 48)) for r in (many, one))
-        assert torch.equal(a.rgb, b.rgb)
-        assert a.mask.any()
 
 
 def test_bad_settings(bodies):
