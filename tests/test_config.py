@@ -22,20 +22,17 @@ GROUPS = sorted(
 MODULES = {
     "renderer",
     "viewpoints",
-    "words",
     "bow",
     "retrieval",
     "matcher",
     "pnp",
-    "start",
     "scorer",
     "hypotheses",
-    "crop",
     "pictures",
-    "projection",
     "robust_loss",
     "refiner",
 }
+INLINE = ["crop", "projection", "words", "start"]  # of config.yaml
 # What makes other extractors small; as for dinov2, their weights are not here.
 SIZES = "hidden_size: 24, num_attention_heads: 2, num_hidden_layers: 1"
 SMALL = {
@@ -111,8 +108,6 @@ def test_every_option_is_instantiated(group, option, tiny_bop, monkeypatch):
         assert isinstance(instantiate(cfg.extractor), PatchExtractor)
         assert cfg.sigma == "auto" or cfg.sigma > 0
         assert cfg.crop.background in ("keep", "black")
-    elif (group, option) == ("start", "none"):
-        assert cfg.start is None
     elif group in MODULES:
         assert instantiate(cfg[group]) is not None
     elif group == "data":
@@ -120,19 +115,36 @@ def test_every_option_is_instantiated(group, option, tiny_bop, monkeypatch):
     elif group == "masks":
         cfg.data.root = str(tiny_bop)
         assert len(instantiate(cfg.masks)(BopDataset(tiny_bop))) == 3
-    elif group == "corruption":
-        assert instantiate(cfg.corruption)(DenseSift()).fingerprint() == DenseSift().fingerprint()
     else:
         pytest.fail(f"no test instantiates the group {group}")
 
 
-def test_defaults_are_the_papers():
+@pytest.mark.parametrize("name", INLINE)
+def test_nodes_of_the_default_are_instantiated(name):
+    node = load()[name]
+    assert instantiate(node) is not None
+    same_as_constructor(node, {"background"}, defaults=True)
+
+
+def test_queries_are_corrupted_and_templates_are_not():
+    corruption = load("config", "experiment=oracle_noise").corruption
+    assert instantiate(corruption)(DenseSift()).fingerprint() == DenseSift().fingerprint()
+
+
+@pytest.mark.parametrize("app", sorted({path.stem for path in CONF.glob("*.yaml")} - {"config"}))
+def test_a_run_has_a_folder_of_its_app(app):
+    cfg = load_with_hydra(app, f"hydra.job.name={app}")
+    assert Path(cfg.hydra.run.dir).parts[:2] == ("outputs", app)
+    assert not cfg.hydra.job.chdir
+
+
+def test_the_default_is_the_papers_but_for_what_was_measured():
     cfg = load()
     # Chosen by measurement, the paper has other choices; everything else is the paper's.
     assert (cfg.pnp.solver, cfg.pnp.mirror, cfg.pnp.guidance) == ("p3p", True, 2.0)
     assert (cfg.bow.normalization, cfg.crop.background) == ("hellinger", "black")
     paper = load("config", "experiment=paper")
-    own = ["pnp=epnp_ransac", "retrieval=bag_of_words", "start=none", "scorer=inliers"]
+    own = ["pnp=epnp_ransac", "retrieval=bag_of_words", "start=null", "scorer=inliers"]
     assert load("config", *own, "bow.normalization=cosine", "crop.background=keep") == paper
     assert (cfg.extractor.variant, cfg.extractor.layer, cfg.sigma) == ("vitl14_reg", 18, 10.0)
     assert (cfg.crop.size, cfg.crop.fill, cfg.viewpoints.count) == (420, 0.6, 800)
@@ -163,14 +175,11 @@ DELIBERATE = {
     ("pnp", "dlt_ransac"): {"solver", "guidance"},
     ("robust_loss", "huber"): {"scale"},
     ("robust_loss", "barron"): {"scale"},
-    ("crop", "perspective"): {"background"},
     ("refiner", "featuremetric_views"): {"num_views", "mask_margin"},
 }
 
 
-@pytest.mark.parametrize(
-    ("group", "option"), [g for g in GROUPS if g[0] in {*MODULES, "extractor"} and g != ("start", "none")]
-)
+@pytest.mark.parametrize(("group", "option"), [g for g in GROUPS if g[0] in {*MODULES, "extractor"}])
 def test_config_and_constructor_have_the_same_keys_and_defaults(group, option):
     cfg = load("config", f"{group}={option}")[group]
     same_as_constructor(cfg, DELIBERATE.get((group, option), set()), defaults=group != "extractor")
