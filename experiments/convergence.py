@@ -3,7 +3,6 @@
 python experiments/convergence.py data=lmo experiment=oracle viewpoints.count=400 words.num_words=1024
 """
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -29,7 +28,7 @@ from foundpose.geometry import (
 from foundpose.refinement import Observation, PoseProposals
 from foundpose.rendering import load_mesh
 from foundpose.representation import ObjectGroups
-from foundpose.utils.files import write_atomically
+from foundpose.utils.files import write_atomically, write_json
 from foundpose.utils.progress import ProgressBars
 
 
@@ -50,7 +49,7 @@ def run(cfg: DictConfig, output: Path) -> None:
     objects = {}
     for obj_id in wanted_objects(cfg, dataset):
         mesh = load_mesh(dataset.mesh_path(obj_id))
-        name = f"{dataset.name}-{obj_id:06d}"
+        name = dataset.object_name(obj_id)
         objects[obj_id] = (mesh, method.store.get(mesh, name, ProgressBars(name)).to(cfg.device))
     degrees = torch.linspace(0, cfg.max_degrees, cfg.perturbations + 1)[1:]
     generator = torch.Generator().manual_seed(cfg.seed)
@@ -119,9 +118,7 @@ def run(cfg: DictConfig, output: Path) -> None:
         "degrees": degrees.tolist(),
         "basin": basin.tolist(),
     }
-    write_atomically(
-        output / "results.json", lambda temporary: temporary.write_text(json.dumps(facts, indent=1))
-    )
+    write_json(output / "results.json", facts)
     plot_basin(output / "basin.png", degrees, basin, cfg.translation_per_degree)
     print_table(table)
     print(f"{len(instances)} instances; written to {output}")

@@ -22,6 +22,7 @@ from tqdm import tqdm
 from foundpose.bop import (
     BopDataset,
     Instance,
+    plausible_mask,
     read_image,
     read_mask,
     result_file_name,
@@ -44,9 +45,6 @@ from foundpose.utils.files import write_json
 from foundpose.utils.progress import ProgressBars
 from foundpose.utils.timing import StageTimer
 from foundpose.visualization import save_estimate_figure
-
-# Settings that may change when a run is resumed.
-MAY_CHANGE = ("device", "max_images", "overlays", "representations", "artefacts")
 
 
 @hydra.main(version_base="1.3", config_path="../conf", config_name="estimate")
@@ -71,10 +69,11 @@ def estimate_picture(cfg: DictConfig, output: Path) -> None:
     if min(fx, fy) <= 0:
         raise ValueError(f"focal lengths must be positive, got fx={fx}, fy={fy}")
     K = intrinsics_matrix(fx, fy, cx, cy)
-    image = read_image(cfg.image)
+    image = read_image(cfg.image, cfg.background)
     height, width = image.shape[1:]
     if cfg.mask is not None:
         mask = read_mask(cfg.mask, (height, width))
+        mask = plausible_mask(mask, f"the mask {cfg.mask}", cfg.largest_component)
     else:
         box = numbers(cfg, "box", "[x,y,width,height]", 4)
         mask = masks_from_boxes(boxes_from_xywh(torch.tensor([box])), height, width)[0]
@@ -84,7 +83,7 @@ def estimate_picture(cfg: DictConfig, output: Path) -> None:
         image, mask = undistort(image, mask, K, numbers(cfg, "distortion", "[k1,k2,p1,p2,…]"))
 
     mesh = load_mesh(cfg.mesh)
-    claim_run_folder(output, cfg, MAY_CHANGE)
+    claim_run_folder(output, cfg)
     method = build_method(cfg)
     name = Path(cfg.mesh).stem
     representation = method.store.get(mesh, name, ProgressBars(name)).to(cfg.device)
@@ -135,7 +134,7 @@ def estimate_dataset(cfg: DictConfig, output: Path) -> None:
     images = sorted(by_image)[: cfg.max_images]
     if not images:
         raise ValueError(f"no instance of the objects {sorted(wanted)} in {dataset.targets_path}")
-    claim_run_folder(output, cfg, MAY_CHANGE)
+    claim_run_folder(output, cfg, ("max_images",))  # images are estimated one by one
 
     method = build_method(cfg)
     pictures = instantiate(cfg.pictures)

@@ -23,9 +23,7 @@ def meshes_to_onboard(cfg: DictConfig) -> dict[str, Path]:
     if cfg.mesh is not None:
         return {Path(cfg.mesh).stem: Path(cfg.mesh)}
     dataset: BopDataset = instantiate(cfg.data)
-    return {
-        f"{dataset.name}-{obj_id:06d}": dataset.mesh_path(obj_id) for obj_id in wanted_objects(cfg, dataset)
-    }
+    return {dataset.object_name(obj_id): dataset.mesh_path(obj_id) for obj_id in wanted_objects(cfg, dataset)}
 
 
 @hydra.main(version_base="1.3", config_path="../conf", config_name="onboard")

@@ -36,7 +36,7 @@ from foundpose import FoundPose
 from foundpose.config import clear_errors
 from foundpose.representation import ObjectRepresentation
 from foundpose.representation.quantization import Storage
-from foundpose.utils.files import write_atomically, write_json
+from foundpose.utils.files import write_atomically, write_json, write_text
 
 _MIB = 2**20
 _GIB = 2**30
@@ -130,7 +130,7 @@ def main(cfg: DictConfig) -> None:
         }
         write_json(folder / "scaling.json", content)
         text = table(rows)
-        write_atomically(folder / "scaling.md", lambda temporary: temporary.write_text(text))
+        write_text(folder / "scaling.md", text)
         for suffix in (".png", ".pdf"):
             picture = plot(rows)
             write_atomically(folder / f"scaling{suffix}", lambda t, p=picture: p.savefig(t, dpi=150))  # type: ignore[misc]

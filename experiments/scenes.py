@@ -105,7 +105,7 @@ def bop_picture(dataset: BopDataset, scene_id: int, im_id: int, obj_id: int) -> 
         raise ValueError(f"object {obj_id} is hidden in image {im_id} of scene {scene_id}")
     T = truth.T_camera_from_model
     return KnownScene(
-        f"{dataset.name}-{obj_id:06d}",
+        dataset.object_name(obj_id),
         load_mesh(dataset.mesh_path(obj_id)),
         dataset.image(scene_id, im_id),
         dataset.intrinsics(scene_id, im_id).float(),

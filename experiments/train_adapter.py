@@ -37,11 +37,9 @@ from foundpose.training import (
     summarize,
 )
 from foundpose.training.meshes import meshes_to_train_on, small_mesh
-from foundpose.utils.files import write_atomically
+from foundpose.utils.files import write_atomically, write_json, write_text
 from foundpose.utils.progress import ProgressBars
 
-# Settings that may change when a run is resumed; with more epochs in trainer it trains on.
-MAY_CHANGE = ("device", "representations", "trainer")
 # Procedural objects are numbered from here; scenes of the held-out object are like no scene trained on.
 TRAINING_OBJECTS, VALIDATION_OBJECTS, HELD_OUT_SCENES = 1000, 2000, 10_000
 MODES = ("retrieved", "nearest")
@@ -78,7 +76,7 @@ def run(cfg: DictConfig, output: Path) -> None:
             "the held-out object is among those trained on; give another held_out or held_out_seed"
         )
     symmetries = {name: wanted_symmetries(cfg, name) for name in ("held_out", "meshes", "validation")}
-    claim_run_folder(output, cfg, MAY_CHANGE)
+    claim_run_folder(output, cfg)
     pl.seed_everything(cfg.seed, verbose=False)
     clock = Clock(output / "seconds.json")
     with clock("before"):
@@ -105,9 +103,7 @@ def run(cfg: DictConfig, output: Path) -> None:
         "seconds": clock.seconds,
         "settings": OmegaConf.to_container(cfg, resolve=True),
     }
-    write_atomically(
-        output / "results.json", lambda temporary: temporary.write_text(json.dumps(facts, indent=1))
-    )
+    write_json(output / "results.json", facts)
     print_table(results)
     print("seconds: " + ", ".join(f"{name} {value:.0f}" for name, value in clock.seconds.items()))
     print(f"adapter: {output / 'adapter.safetensors'}; in every app: --config-dir {output} extractor=adapted")
@@ -150,8 +146,7 @@ class Clock:
             yield
         finally:  # the part before an interruption counts too
             self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
-            text = json.dumps(self.seconds)
-            write_atomically(self.path, lambda temporary: temporary.write_text(text))
+            write_json(self.path, self.seconds)
 
 
 def with_adapter(cfg: DictConfig, module: AdapterTraining, weights: Path) -> DictConfig:
@@ -171,7 +166,7 @@ def write_extractor(cfg: DictConfig, path: Path) -> None:
     """Write an option of the config group ``extractor``, for the apps that are told of its folder."""
     option = {name: cfg[name] for name in EXTRACTOR_SETTINGS}
     text = "# @package _global_\n" + OmegaConf.to_yaml(OmegaConf.create(option), resolve=True)
-    write_atomically(path, lambda temporary: temporary.write_text(text))
+    write_text(path, text)
 
 
 def measure(

@@ -4,7 +4,6 @@ python experiments/train_refiner.py
 python experiments/train_refiner.py meshes=[a.ply,b.ply,c.ply] held_out=d.ply
 """
 
-import json
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -32,11 +31,9 @@ from foundpose.training import (
     summarize,
 )
 from foundpose.training.meshes import meshes_to_train_on, small_mesh
-from foundpose.utils.files import write_atomically
+from foundpose.utils.files import write_atomically, write_json
 from foundpose.utils.progress import ProgressBars
 
-# Settings that may change when a run is resumed; with more epochs in trainer it trains on.
-MAY_CHANGE = ("device", "representations", "trainer")
 # Procedural objects are numbered from here; pictures of the held-out object are like none trained on.
 TRAINING_OBJECTS, VALIDATION_OBJECTS, HELD_OUT_SEED = 1000, 2000, 10_000
 
@@ -59,7 +56,7 @@ def run(cfg: DictConfig, output: Path) -> None:
         raise ValueError(
             "the held-out object is among those trained on; give another held_out or held_out_seed"
         )
-    claim_run_folder(output, cfg, MAY_CHANGE)
+    claim_run_folder(output, cfg)
     pl.seed_everything(cfg.seed, verbose=False)
     seconds: dict[str, float] = {}
 
@@ -75,9 +72,7 @@ def run(cfg: DictConfig, output: Path) -> None:
         "change": compare(before, after),
     }
     facts = {"results": results, "seconds": seconds, "settings": OmegaConf.to_container(cfg, resolve=True)}
-    write_atomically(
-        output / "results.json", lambda temporary: temporary.write_text(json.dumps(facts, indent=1))
-    )
+    write_json(output / "results.json", facts)
     print_table(results)
     print("seconds: " + ", ".join(f"{name} {value:.0f}" for name, value in seconds.items()))
     print(f"network: {weights}")

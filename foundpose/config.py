@@ -22,10 +22,9 @@ from foundpose.features import PatchExtractor
 from foundpose.onboarding import ArtefactStore, Onboarder, RepresentationStore
 from foundpose.pipeline import FoundPose
 from foundpose.rendering import RendererNotAvailableError
-from foundpose.utils.files import write_atomically
+from foundpose.utils.files import write_text
 
-# Settings that may change when an evaluation is resumed: they change no pose, or say where things lie and what they
-# are called.
+# Settings that may change when a run is resumed: they change no pose, or say where things lie and are called.
 MAY_CHANGE = (
     "device",
     "trainer",
@@ -37,6 +36,7 @@ MAY_CHANGE = (
     "row",
     "folder",
     "report_only",
+    "overlays",
     "data_module.num_workers",
     "data_module.prepare_data_per_node",
 )
@@ -122,20 +122,20 @@ def wanted_objects(cfg: DictConfig, dataset: BopDataset) -> list[int]:
     return ids
 
 
-def claim_run_folder(folder: Path, cfg: DictConfig, ignore: tuple[str, ...]) -> None:
+def claim_run_folder(folder: Path, cfg: DictConfig, may_change: tuple[str, ...] = ()) -> None:
     """Record the settings of a run in its folder, or make sure that a run being resumed has the same ones.
 
     Args:
         folder: the run's folder.
         cfg: the settings.
-        ignore: keys that may change between the parts of a run, as ``trainer`` or ``data_module.num_workers``.
+        may_change: keys that may change between the parts of a run besides :data:`MAY_CHANGE`.
 
     Raises:
         ValueError: the folder belongs to a run with other settings; the message shows the difference.
     """
     settings = OmegaConf.to_container(cfg, resolve=True)
     assert isinstance(settings, dict)
-    for key in ignore:
+    for key in (*MAY_CHANGE, *may_change):
         *parents, last = key.split(".")
         node: Any = settings
         for parent in parents:
@@ -156,7 +156,7 @@ def claim_run_folder(folder: Path, cfg: DictConfig, ignore: tuple[str, ...]) -> 
                 "Difference:\n" + "\n".join(changes)
             )
         return
-    write_atomically(path, lambda temporary: temporary.write_text(text))
+    write_text(path, text)
 
 
 @contextmanager

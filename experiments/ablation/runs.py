@@ -1,6 +1,5 @@
 """Runs one set of settings of a sweep, once, and reports on all that ran: the part of this room that knows Hydra."""
 
-import hashlib
 import json
 import re
 import sys
@@ -21,7 +20,8 @@ from ablation.sweeps import SWEEP_FIGURES, sweep_table
 from ablation.tables import paper_table
 from ablation.text_tables import Format
 from foundpose.config import MAY_CHANGE
-from foundpose.utils.files import write_atomically
+from foundpose.utils.files import write_text
+from foundpose.utils.settings import digest
 
 # Keys that say where things lie and what they are called, not what is computed.
 _NOT_SETTINGS = ("folder", "representations", "artefacts", "results", "method", "row", "report_only")
@@ -71,8 +71,7 @@ def run_folder(cfg: DictConfig) -> Path:
         for key, value in run_settings(cfg).items()
         if not any(key == name or key.startswith(f"{name}.") for name in MAY_CHANGE)
     }
-    digest = hashlib.sha256(json.dumps(kept, sort_keys=True, default=str).encode()).hexdigest()[:12]
-    return Path(cfg.folder) / "runs" / f"{_dataset(cfg)}-{digest}"
+    return Path(cfg.folder) / "runs" / f"{_dataset(cfg)}-{digest(kept)[:12]}"
 
 
 def run_once(cfg: DictConfig, name: str | None = None, overrides: Sequence[str] = ()) -> RunRecord:
@@ -119,7 +118,7 @@ def run_once(cfg: DictConfig, name: str | None = None, overrides: Sequence[str] 
         (folder / "error.txt").unlink(missing_ok=True)
     except Exception as error:
         text = traceback.format_exc()
-        write_atomically(folder / "error.txt", lambda temporary: temporary.write_text(text))
+        write_text(folder / "error.txt", text)
         cause = _root_cause(error)
         record = replace(started, error=f"{type(cause).__name__}: {cause}")
         print(f"failed: {folder}: {record.error}", file=sys.stderr)
@@ -269,4 +268,4 @@ def _telling_apart(groups: Sequence[Sequence[RunRecord]], key: str) -> list[str]
 
 
 def _write_text(path: Path, text: str) -> None:
-    write_atomically(path, lambda temporary: temporary.write_text(text))
+    write_text(path, text)

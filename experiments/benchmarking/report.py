@@ -13,7 +13,7 @@ from benchmarking.inference import HOOKED, YARDSTICK
 from benchmarking.plots import plot_curve, plot_shares
 from benchmarking.references import Comparison
 from benchmarking.tasks import Row
-from foundpose.utils.files import write_atomically, write_json
+from foundpose.utils.files import write_json, write_text
 
 SCHEMA_VERSION = 1
 _BUSY = 0.5  # load average by core
@@ -95,7 +95,7 @@ def write_report(result: BenchmarkResult, folder: Path) -> str:
     """
     write_json(folder / "benchmark.json", result.as_json())
     text = render(result)
-    write_atomically(folder / "benchmark.md", lambda temporary: temporary.write_text(text))
+    write_text(folder / "benchmark.md", text)
     for curve in result.curves:
         plot_curve(curve, folder / "plots")
     for batch_size in shares(result.rows, YARDSTICK):

@@ -1,8 +1,9 @@
 """Files of the BOP benchmark: datasets, detections and results."""
 
 from foundpose.bop.dataset import BopDataset
-from foundpose.bop.files import BopError, read_depth, read_image, read_mask
-from foundpose.bop.instances import Instance, decode_rle, detected_instances, ground_truth_instances
+from foundpose.bop.files import BopError
+from foundpose.bop.instances import Instance, detected_instances, ground_truth_instances
+from foundpose.bop.masks import largest_component, plausible_mask, read_mask
 from foundpose.bop.results import (
     PoseResult,
     best_of_targets,
@@ -15,22 +16,27 @@ from foundpose.bop.results import (
 from foundpose.bop.scenes import Annotation
 from foundpose.bop.scores import Scores
 from foundpose.bop.scoring import check_functions, score_results
+from foundpose.bop.segmentation import decode_segmentation
 from foundpose.bop.targets import Target
+from foundpose.utils.pictures import PictureError, read_depth, read_image
 
 __all__ = [
     "Annotation",
     "BopDataset",
     "BopError",
     "Instance",
+    "PictureError",
     "PoseResult",
     "Scores",
     "Target",
     "best_of_targets",
     "check_functions",
     "check_times",
-    "decode_rle",
+    "decode_segmentation",
     "detected_instances",
     "ground_truth_instances",
+    "largest_component",
+    "plausible_mask",
     "read_depth",
     "read_image",
     "read_mask",

@@ -6,19 +6,14 @@ from typing import Any
 
 from torch import Tensor
 
-from foundpose.bop.files import (
-    BopError,
-    JsonCache,
-    describe_folder,
-    read_depth,
-    read_image,
-    read_image_size,
-    read_mask,
-)
+from foundpose.bop.files import BopError, JsonCache
+from foundpose.bop.masks import read_mask
 from foundpose.bop.scenes import Annotation, parse_annotations, parse_depth_scale, parse_intrinsics
 from foundpose.bop.targets import Target, count_visible, describe_target, parse_targets
 from foundpose.bop.vsd import BOP_DELTA
 from foundpose.geometry.symmetries import Symmetries, symmetries_from_models_info
+from foundpose.utils.files import describe_folder
+from foundpose.utils.pictures import read_depth, read_image, read_image_size
 
 
 class BopDataset:
@@ -70,6 +65,10 @@ class BopDataset:
     def object_ids(self) -> list[int]:
         """Ids of all objects, ascending."""
         return sorted(self.models_info)
+
+    def object_name(self, obj_id: int) -> str:
+        """Name of an object's representation, such as ``lmo-000005``."""
+        return f"{self.name}-{obj_id:06d}"
 
     def mesh_path(self, obj_id: int) -> Path:
         """Mesh of an object, for onboarding."""
@@ -192,7 +191,8 @@ class BopDataset:
 
         Raises:
             FileNotFoundError: the image has none.
-            BopError: not a depth image, one of another size than its image, or one without ``depth_scale``.
+            PictureError: not a depth image, or one of another size than its image.
+            BopError: there is no ``depth_scale``.
         """
         path = self._find_image(scene_id, im_id, ("depth",), (".png", ".tif"))
         if path is None:

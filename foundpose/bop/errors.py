@@ -36,13 +36,7 @@ class PoseErrors(NamedTuple):
     mspd: Tensor
 
 
-def mssd(
-    T_est: Tensor,
-    T_true: Tensor,
-    vertices: Tensor,
-    symmetries: Tensor | None = None,
-    chunk_bytes: int | None = None,
-) -> Tensor:
+def mssd(T_est: Tensor, T_true: Tensor, vertices: Tensor, symmetries: Tensor | None = None) -> Tensor:
     """Maximum symmetry-aware surface distance: min over S of max over x of ``|T_est x - T_true S x|``.
 
     Args:
@@ -51,8 +45,6 @@ def mssd(
         vertices: (V, 3) of the evaluation mesh. Those on the convex hull are enough: the distance is a convex
             function of x, which is largest there (:class:`ModelErrors` makes use of that).
         symmetries: (S, 4, 4) ``T_model_from_model``, the identity among them; None: the identity alone.
-        chunk_bytes: about how much memory to work with; default 4 MiB on the CPU, where it should fit into the
-            cache, and 256 MiB elsewhere. The result does not depend on it.
 
     Returns:
         (B,) in mesh units; +inf where a pose is not finite.
@@ -66,9 +58,7 @@ def mssd(
     """
     check_pairs(T_est, T_true, vertices, symmetries)
     est, true, finite = finite_poses(T_est, T_true)
-    at = worst_vertices(
-        est, true, vertices, symmetries, surface_offsets, working_bytes(vertices, chunk_bytes)
-    )
+    at = worst_vertices(est, true, vertices, symmetries, surface_offsets, working_bytes(vertices))
     worst = homogeneous(vertices[at.vertex, None])
     offsets = surface_offsets(est, _compose(true, symmetries, at.symmetry), worst)
     return _lengths(offsets, finite)
@@ -80,7 +70,6 @@ def mspd(
     K: Tensor,
     vertices: Tensor,
     symmetries: Tensor | None = None,
-    chunk_bytes: int | None = None,
 ) -> Tensor:
     """Maximum symmetry-aware projection distance: as :func:`mssd` with projections to the image in place of points.
 
@@ -90,7 +79,6 @@ def mspd(
         K: (B, 3, 3) or (1, 3, 3) intrinsics in pixels, last row 0 0 1.
         vertices: (V, 3), all of the evaluation mesh.
         symmetries: (S, 4, 4) ``T_model_from_model``, the identity among them; None: the identity alone.
-        chunk_bytes: see :func:`mssd`.
 
     Returns:
         (B,) in pixels of the image at hand (BOP multiplies by 640 / image width before it compares with a
@@ -110,20 +98,19 @@ def mspd(
     focal = torch.eye(3, dtype=K.dtype, device=K.device).repeat(len(est), 1, 1)
     focal[:, :2, :2] = torch.where(finite[:, None, None], K[:, :2, :2], focal[:, :2, :2])
     est, true = focal @ est, focal @ true
-    at = worst_vertices(est, true, vertices, symmetries, pixel_offsets, working_bytes(vertices, chunk_bytes))
+    at = worst_vertices(est, true, vertices, symmetries, pixel_offsets, working_bytes(vertices))
     worst = homogeneous(vertices[at.vertex, None])
     offsets = pixel_offsets(est, _compose(true, symmetries, at.symmetry), worst)
     return _lengths(offsets, finite)
 
 
-def add(T_est: Tensor, T_true: Tensor, vertices: Tensor, chunk_bytes: int | None = None) -> Tensor:
+def add(T_est: Tensor, T_true: Tensor, vertices: Tensor) -> Tensor:
     """Average distance of model points: mean over x of ``|T_est x - T_true x|``.
 
     Args:
         T_est: (B, 4, 4) estimated ``T_camera_from_model``.
         T_true: (B, 4, 4) true ones.
         vertices: (V, 3) of the evaluation mesh.
-        chunk_bytes: see :func:`mssd`; with autograd, what the graph holds comes on top (B·V numbers).
 
     Returns:
         (B,) in mesh units; +inf where a pose is not finite.
@@ -142,12 +129,12 @@ def add(T_est: Tensor, T_true: Tensor, vertices: Tensor, chunk_bytes: int | None
     rows = 6 * points[0].nbytes
     errors = [
         torch.linalg.vector_norm(surface_offsets(est[part], true[part], points), dim=1).mean(dim=1)
-        for part in slices(len(est), rows, working_bytes(vertices, chunk_bytes))
+        for part in slices(len(est), rows, working_bytes(vertices))
     ]
     return _infinite_unless(finite, torch.cat([est[:0, 0, 0], *errors]))
 
 
-def adi(T_est: Tensor, T_true: Tensor, vertices: Tensor, chunk_bytes: int | None = None) -> Tensor:
+def adi(T_est: Tensor, T_true: Tensor, vertices: Tensor) -> Tensor:
     """Average distance to the nearest point, ADD-S: mean over x of min over y of ``|T_true x - T_est y|``.
 
     Every point is compared with every other: V² distances per pose, 4 to 7 ns each on a CPU core (0.1 to
@@ -157,7 +144,6 @@ def adi(T_est: Tensor, T_true: Tensor, vertices: Tensor, chunk_bytes: int | None
         T_est: (B, 4, 4) estimated ``T_camera_from_model``.
         T_true: (B, 4, 4) true ones.
         vertices: (V, 3) of the evaluation mesh.
-        chunk_bytes: see :func:`mssd`; with autograd, what the graph holds comes on top (B·V numbers).
 
     Returns:
         (B,) in mesh units; +inf where a pose is not finite.
@@ -174,7 +160,7 @@ def adi(T_est: Tensor, T_true: Tensor, vertices: Tensor, chunk_bytes: int | None
     # Seen from the middle between the poses: coordinates as small as they get keep the most digits.
     middle = 0.5 * (est[:, :, 3] + true[:, :, 3]).detach()
     points = homogeneous(vertices)
-    budget = working_bytes(vertices, chunk_bytes)
+    budget = working_bytes(vertices)
     errors = [est[:0, 0, 0]]
     for part in slices(len(est), len(vertices) * points[0].nbytes, budget):
         ours, theirs = ((T[part] @ points - middle[part, :, None]).mT.contiguous() for T in (est, true))
@@ -197,8 +183,6 @@ class ModelErrors(nn.Module):
         vertices: (V, 3) of the evaluation mesh, float32 or float64; poses must have the same dtype.
         symmetries: (S, 4, 4) ``T_model_from_model``, the identity among them; None (default): no symmetry.
         diameter: of the object, mesh units; only kept, for thresholds. Default: not a number.
-        chunk_bytes: about how much memory to work with at a time; default (None) 4 MiB on the CPU and 256 MiB
-            elsewhere, see :func:`mssd`.
 
     Raises:
         ValueError: vertices or symmetries of a wrong shape or dtype, or not finite.
@@ -220,7 +204,6 @@ class ModelErrors(nn.Module):
         vertices: Tensor,
         symmetries: Tensor | None = None,
         diameter: float = float("nan"),
-        chunk_bytes: int | None = None,
     ) -> None:
         super().__init__()
         if symmetries is None:
@@ -228,25 +211,20 @@ class ModelErrors(nn.Module):
         check_model(vertices, symmetries)
         if not bool(torch.isfinite(vertices).all()) or not bool(torch.isfinite(symmetries).all()):
             raise ValueError("vertices and symmetries must be finite, got NaN or infinity")
-        working_bytes(vertices, chunk_bytes)  # refuses what is not positive
         self.register_buffer("vertices", vertices.detach().clone())
         self.register_buffer("hull", self.vertices[_hull_indices(vertices)])
         self.register_buffer("symmetries", symmetries.detach().clone())
         self.diameter = float(diameter)
         self.symmetric = len(symmetries) > 1
-        self.chunk_bytes = chunk_bytes
 
     @classmethod
-    def from_models_info(
-        cls, vertices: Tensor, entry: Mapping[str, Any], step: float = 0.01, chunk_bytes: int | None = None
-    ) -> Self:
+    def from_models_info(cls, vertices: Tensor, entry: Mapping[str, Any], step: float = 0.01) -> Self:
         """Errors of an object as BOP describes it.
 
         Args:
             vertices: (V, 3) of the evaluation mesh.
             entry: of ``models_info.json``: ``diameter`` and, if any, the symmetries.
             step: how finely continuous symmetries are sampled, see :func:`foundpose.geometry.discretise`.
-            chunk_bytes: see :class:`ModelErrors`.
 
         Raises:
             ValueError: an entry without diameter, or with symmetries that are none.
@@ -256,7 +234,7 @@ class ModelErrors(nn.Module):
                 f"an entry of models_info.json must have a diameter, got the keys {sorted(entry)}"
             )
         transforms, valid = discretise(symmetries_from_models_info(entry), step)
-        return cls(vertices, transforms[valid].to(vertices), float(entry["diameter"]), chunk_bytes)
+        return cls(vertices, transforms[valid].to(vertices), float(entry["diameter"]))
 
     def forward(self, T_est: Tensor, T_true: Tensor, K: Tensor) -> PoseErrors:
         """MSSD and MSPD of B pairs.
@@ -270,14 +248,14 @@ class ModelErrors(nn.Module):
             :class:`PoseErrors`. Differentiable w.r.t. the arguments.
         """
         return PoseErrors(
-            mssd(T_est, T_true, self.hull, self.symmetries, self.chunk_bytes),
-            mspd(T_est, T_true, K, self.vertices, self.symmetries, self.chunk_bytes),
+            mssd(T_est, T_true, self.hull, self.symmetries),
+            mspd(T_est, T_true, K, self.vertices, self.symmetries),
         )
 
     def add_s(self, T_est: Tensor, T_true: Tensor) -> Tensor:
         """ADD-S (:func:`adi`) of an object with symmetries, :func:`add` of another: (B, 4, 4) twice → (B,)."""
         error = adi if self.symmetric else add
-        return error(T_est, T_true, self.vertices, self.chunk_bytes)
+        return error(T_est, T_true, self.vertices)
 
 
 def _hull_indices(vertices: Tensor) -> Tensor:

@@ -1,21 +1,19 @@
 """Which regions of which images to estimate: ground-truth masks or detections."""
 
-import heapq
+import contextlib
 import math
-from collections import defaultdict
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
-from pycocotools import mask as coco_mask
 from torch import Tensor
 
 from foundpose.bop.dataset import BopDataset
-from foundpose.bop.files import BopError, iterate_json_list
-from foundpose.bop.targets import Target
+from foundpose.bop.files import BopError, read_json
+from foundpose.bop.masks import plausible_mask
+from foundpose.bop.matching import best
+from foundpose.bop.segmentation import decode_segmentation, pack_segmentation
+from foundpose.bop.targets import Target, describe_target
 
 
 @dataclass(frozen=True)
@@ -28,8 +26,10 @@ class Instance:
         obj_id: the object that the region is said to show.
         score: confidence of the detector, 1 for ground truth.
         time: seconds that the detector took for the image, 0 for ground truth.
-        segmentation: COCO run-length encoding of the mask, or None for a ground-truth mask.
+        segmentation: packed run lengths or polygons of the mask, or None for a ground-truth mask.
         annotation_index: which ground-truth mask, or None for a detection.
+        largest_component: of a detection whose pieces lie far apart, see :func:`foundpose.bop.plausible_mask`, take
+            the largest alone.
     """
 
     scene_id: int
@@ -37,105 +37,25 @@ class Instance:
     obj_id: int
     score: float
     time: float
-    segmentation: dict[str, Any] | None = None
+    segmentation: dict[str, Any] | list[list[float]] | None = None
     annotation_index: int | None = None
+    largest_component: bool = True
 
     def mask(self, dataset: BopDataset) -> Tensor:
         """The mask (H, W) bool.
 
         Raises:
-            BopError: a mask of another size than its image.
+            BopError: not a mask, or one of another size than its image.
         """
         if self.segmentation is None:
             assert self.annotation_index is not None
             return dataset.visible_mask(self.scene_id, self.im_id, self.annotation_index)
-        name = f"a detection of object {self.obj_id} in image {self.im_id} of scene {self.scene_id}"
+        name = f"a detection of {describe_target(self.scene_id, self.im_id, self.obj_id)}"
         try:
-            mask = decode_rle(self.segmentation)
+            mask = decode_segmentation(self.segmentation, dataset.image_size(self.scene_id, self.im_id))
         except BopError as error:
             raise BopError(f"{name}: {error}") from error
-        size = dataset.image_size(self.scene_id, self.im_id)
-        if tuple(mask.shape) != size:
-            raise BopError(
-                f"{name} has a mask of {mask.shape[1]}x{mask.shape[0]} px, the image has {size[1]}x{size[0]} px"
-            )
-        return mask
-
-
-def decode_rle(segmentation: Mapping[str, Any]) -> Tensor:
-    """Decode a COCO run-length mask, compressed or not, to (H, W) bool.
-
-    Raises:
-        BopError: not a run-length mask.
-    """
-    packed = compress_rle(segmentation)
-    height, width = packed["size"]
-    covered = _covered_pixels(packed["counts"])
-    # pycocotools would show memory that is not its own.
-    if covered != height * width:
-        raise BopError(f"run lengths cover {covered} pixels, the size says {height}x{width}")
-    return torch.from_numpy(np.ascontiguousarray(coco_mask.decode(packed))).bool()
-
-
-def compress_rle(segmentation: Mapping[str, Any]) -> dict[str, Any]:
-    """A COCO run-length mask with its lengths packed to bytes; what is packed already stays so.
-
-    A list of lengths takes some forty times the memory.
-
-    Raises:
-        BopError: not a run-length mask.
-    """
-    try:
-        (height, width), counts = segmentation["size"], segmentation["counts"]
-        if not all(type(value) is int and value > 0 for value in (height, width)):
-            raise ValueError(f"size must be [height, width], got {segmentation['size']!r}")
-        if isinstance(counts, str):
-            counts = counts.encode("ascii")
-        elif isinstance(counts, list):
-            if not all(type(value) is int and value >= 0 for value in counts):
-                raise ValueError("counts must be whole numbers of at least 0")
-            if sum(counts) != height * width:
-                raise BopError(f"run lengths cover {sum(counts)} pixels, the size says {height}x{width}")
-            counts = coco_mask.frPyObjects({"size": [height, width], "counts": counts}, height, width)[
-                "counts"
-            ]
-        if not isinstance(counts, bytes):
-            raise TypeError(f"counts must be a string or a list, got {type(counts).__name__}")
-    except (KeyError, TypeError, ValueError) as error:
-        if isinstance(error, BopError):
-            raise
-        raise BopError(f"not a COCO run-length mask: {error!r}") from error
-    return {"size": [height, width], "counts": counts}
-
-
-def _covered_pixels(counts: bytes) -> int:
-    """Sum of packed run lengths, in COCO's code.
-
-    Each length is written as characters of 5 bits, lowest first, offset by 48, with the 6th bit set where another
-    follows; from the fourth on it is the difference to the length two before.
-
-    Raises:
-        BopError: not that code.
-    """
-    digits = np.frombuffer(counts, dtype=np.uint8).astype(np.int64) - 48
-    last = (digits & 32) == 0
-    if digits.size == 0 or digits.min() < 0 or digits.max() > 63 or not last[-1]:
-        raise BopError(
-            "not a COCO run-length mask: counts is cut off, or holds characters that do not belong there"
-        )
-    starts = np.flatnonzero(np.concatenate([[True], last[:-1]]))
-    place = np.arange(digits.size) - np.repeat(starts, np.diff([*starts, digits.size]))
-    if place.max() > 7:
-        raise BopError("not a COCO run-length mask: counts holds a number beyond all images")
-    values = np.add.reduceat((digits & 31) << (5 * place), starts)
-    # The highest bit of the last character is the sign.
-    values -= ((digits[last] >> 4) & 1) << (5 * place[last] + 5)
-    lengths = values.copy()
-    lengths[1::2] = np.cumsum(values[1::2])
-    lengths[2::2] = np.cumsum(values[2::2])
-    if lengths.min() < 0:
-        raise BopError("not a COCO run-length mask: counts holds a negative length")
-    return int(lengths.sum())
+        return plausible_mask(mask, name, self.largest_component)
 
 
 def ground_truth_instances(dataset: BopDataset, targets: list[Target] | None = None) -> list[Instance]:
@@ -147,12 +67,10 @@ def ground_truth_instances(dataset: BopDataset, targets: list[Target] | None = N
     for target in dataset.localization_targets(targets):
         assert target.obj_id is not None
         found = [a for a in dataset.annotations(target.scene_id, target.im_id) if a.obj_id == target.obj_id]
-        found.sort(key=lambda a: -(a.visible_fraction if a.visible_fraction is not None else 1.0))
+        visible = [1.0 if a.visible_fraction is None else a.visible_fraction for a in found]
         instances += [
-            Instance(
-                target.scene_id, target.im_id, target.obj_id, 1.0, 0.0, annotation_index=annotation.index
-            )
-            for annotation in found[: target.inst_count]
+            Instance(target.scene_id, target.im_id, target.obj_id, 1.0, 0.0, annotation_index=found[i].index)
+            for i in best(visible, target.inst_count)
         ]
     return instances
 
@@ -163,6 +81,7 @@ def detected_instances(
     targets: list[Target] | None = None,
     masks_per_instance: int = 1,
     max_per_image: int | None = 100,
+    largest_component: bool = True,
 ) -> list[Instance]:
     """Detections of the targets, those of highest score; of equal scores, the first in the file.
 
@@ -175,6 +94,7 @@ def detected_instances(
         targets: what to find; all of the dataset's by default.
         masks_per_instance: 1 (the paper's n masks) or more (its 5n); for bop19 targets.
         max_per_image: for bop24 targets; 100 is the benchmark's limit, None is none.
+        largest_component: of masks whose pieces lie far apart take the largest alone.
 
     Returns:
         Target by target, best score first. Masks stay run lengths until they are asked for.
@@ -189,48 +109,47 @@ def detected_instances(
         raise ValueError(f"max_per_image must be at least 1 or null, got {max_per_image}")
     path = _single_json(Path(path))
     targets = dataset.targets() if targets is None else targets
-    limits: dict[tuple[int, int, int | None], float] = {}
-    for target in targets:
-        if target.inst_count is not None:
-            limits[target[:3]] = masks_per_instance * target.inst_count
-        else:
-            limits[target[:3]] = math.inf if max_per_image is None else max_per_image
-    objects = set(dataset.models_info)
-    # For each target the best so far, worst of them first: (score, minus position in the file, instance).
-    best: dict[tuple[int, int, int | None], list[tuple[float, int, Instance]]] = defaultdict(list)
-    for position, entry in enumerate(iterate_json_list(path)):
+    # Packed while they are read: as Python objects, a file's run lengths take many times its size.
+    entries = read_json(path, _packed)
+    if not isinstance(entries, list):
+        raise BopError(f"{path} must hold a JSON list of detections, it holds {type(entries).__name__}")
+    wanted = {target[:3] for target in targets}
+    found: dict[tuple[int, int, int | None], list[Instance]] = {key: [] for key in wanted}
+    for position, entry in enumerate(entries):
         where = f"{path}: entry {position}"
-        scene_id, im_id, obj_id, score, time = _fields(entry, where)
-        if obj_id not in objects:
-            raise BopError(f"{where} is of object {obj_id}; the dataset has {sorted(objects)}")
-        key: tuple[int, int, int | None] = (scene_id, im_id, obj_id)
-        if key not in limits:
-            key = (scene_id, im_id, None)
-        limit = limits.get(key, 0)
-        if limit == 0 or (len(best[key]) == limit and best[key][0][0] >= score):
-            continue
-        try:
-            segmentation = compress_rle(entry["segmentation"])
-        except BopError as error:
-            raise BopError(f"{where}: {error}") from error
-        item = (score, -position, Instance(scene_id, im_id, obj_id, score, time, segmentation))
-        if len(best[key]) == limit:
-            heapq.heapreplace(best[key], item)
-        else:
-            heapq.heappush(best[key], item)
-    return [
-        instance
-        for target in targets
-        for _, _, instance in sorted(best[target[:3]], key=lambda i: i[:2])[::-1]
-    ]
+        instance = _instance(entry, where, largest_component)
+        if instance.obj_id not in dataset.models_info:
+            raise BopError(f"{where} is of object {instance.obj_id}; the dataset has {dataset.object_ids}")
+        image = (instance.scene_id, instance.im_id)
+        for key in ((*image, instance.obj_id), (*image, None)):
+            if key in wanted:
+                found[key].append(instance)
+    chosen: list[Instance] = []
+    for target in targets:
+        limit = max_per_image if target.inst_count is None else masks_per_instance * target.inst_count
+        mine = found[target[:3]]
+        chosen += [mine[i] for i in best([instance.score for instance in mine], limit)]
+    return chosen
 
 
-def _fields(entry: Any, where: str) -> tuple[int, int, int, float, float]:
-    """Scene, image, object, score and time of a detection."""
+def _packed(entry: dict[str, Any]) -> dict[str, Any]:
+    """An object of a file of detections, with its segmentation packed; one that is wrong stays as it is."""
+    if "segmentation" in entry:
+        with contextlib.suppress(BopError):
+            entry["segmentation"] = pack_segmentation(entry["segmentation"])
+    return entry
+
+
+def _instance(entry: Any, where: str, largest_component: bool) -> Instance:
+    """A detection of an entry of a file.
+
+    Raises:
+        BopError: a field is missing or cannot be right.
+    """
     try:
         ids = [entry[name] for name in ("scene_id", "image_id", "category_id")]
         score, time = float(entry["score"]), float(entry.get("time", 0.0))
-        entry["segmentation"]
+        segmentation = entry["segmentation"]
         if not all(type(value) is int for value in ids):
             raise TypeError(f"scene_id, image_id and category_id must be whole numbers, got {ids}")
     except (AttributeError, KeyError, TypeError, ValueError) as error:
@@ -239,7 +158,11 @@ def _fields(entry: Any, where: str) -> tuple[int, int, int, float, float]:
         raise BopError(f"{where}: score must be finite, got {score}")
     if not 0 <= time < math.inf:
         raise BopError(f"{where}: time must be seconds, at least 0, got {time}")
-    return ids[0], ids[1], ids[2], score, time
+    try:
+        packed = pack_segmentation(segmentation)
+    except BopError as error:
+        raise BopError(f"{where}: {error}") from error
+    return Instance(ids[0], ids[1], ids[2], score, time, packed, largest_component=largest_component)
 
 
 def _single_json(path: Path) -> Path:

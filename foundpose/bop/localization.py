@@ -9,7 +9,7 @@ from torch.nn.utils.rnn import pad_sequence
 
 from foundpose.bop.dataset import BopDataset
 from foundpose.bop.files import BopError
-from foundpose.bop.matching import best_first, most_visible
+from foundpose.bop.matching import best
 from foundpose.bop.results import PoseResult
 from foundpose.bop.targets import Target
 
@@ -76,46 +76,40 @@ def localization(
     images = sorted({key[:2] for key in keys})
     image_number = {image: i for i, image in enumerate(images)}
     object_ids = sorted({obj_id for *_, obj_id in keys if obj_id is not None})
-    inst_count = torch.tensor([t.inst_count for t in targets])
-
-    result_lists: list[list[int]] = [[] for _ in targets]
+    estimates: list[list[int]] = [[] for _ in targets]
     outside = 0
     for index, result in enumerate(results):
         n = number.get((result.scene_id, result.im_id, result.obj_id))
         if n is None:
             outside += 1
         else:
-            result_lists[n].append(index)
-    scores = torch.tensor([result.score for result in results], dtype=torch.float64)
-    listed = _padded(result_lists)
-    ranking = best_first(_lookup(scores, listed), listed >= 0, inst_count)
-    estimates = torch.where(ranking.counted, listed.gather(1, ranking.order), -1)
-
-    truth_lists: list[list[int]] = [[] for _ in targets]
+            estimates[n].append(index)
+    annotations: list[list[int]] = [[] for _ in targets]
     poses: list[Tensor] = []
     visibility: list[float] = []
     for scene_id, im_id in images:
         for annotation in dataset.annotations(scene_id, im_id):
             n = number.get((scene_id, im_id, annotation.obj_id))
             if n is not None:
-                truth_lists[n].append(len(poses))
+                annotations[n].append(len(poses))
                 poses.append(annotation.T_camera_from_model)
                 visible = annotation.visible_fraction
                 visibility.append(1.0 if visible is None else visible)
-    annotated = _padded(truth_lists)
-    shares = _lookup(torch.tensor(visibility, dtype=torch.float64), annotated)
-    wanted = torch.where(most_visible(shares, annotated >= 0, inst_count), annotated, -1)
-    # Sorted stably by being padding: keeps the order, and drops what need not be found.
-    wanted = wanted.gather(1, (wanted < 0).byte().sort(dim=1, stable=True).indices)
-    most = int(inst_count.max())
+    for n, target in enumerate(targets):
+        count = target.inst_count
+        estimates[n] = [estimates[n][i] for i in best([results[r].score for r in estimates[n]], count)]
+        # In the order given, which decides between equal errors.
+        annotations[n] = [
+            annotations[n][i] for i in sorted(best([visibility[a] for a in annotations[n]], count))
+        ]
     return Localization(
         images=images,
         image=torch.tensor([image_number[key[:2]] for key in keys]),
         object_ids=object_ids,
         object=torch.tensor([object_ids.index(obj_id) for *_, obj_id in keys if obj_id is not None]),
-        inst_count=inst_count,
-        estimates=estimates[:, :most],
-        annotations=wanted[:, :most],
+        inst_count=torch.tensor([t.inst_count for t in targets]),
+        estimates=_padded(estimates),
+        annotations=_padded(annotations),
         T_est=_stacked([result.T_camera_from_model for result in results]),
         T_true=_stacked(poses),
         outside=outside,
@@ -125,11 +119,6 @@ def localization(
 def _padded(lists: list[list[int]]) -> Tensor:
     rows = [torch.tensor(row, dtype=torch.int64) for row in lists]
     return pad_sequence(rows, batch_first=True, padding_value=-1)
-
-
-def _lookup(values: Tensor, index: Tensor) -> Tensor:
-    """Values (R,) at an index (N, n); 0 where it is −1."""
-    return torch.cat([values, values.new_zeros(1)])[index]
 
 
 def _stacked(poses: list[Tensor]) -> Tensor:

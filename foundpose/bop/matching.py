@@ -1,73 +1,18 @@
 """Which estimates of a target count, and which annotation each of them is matched to (rules of BOP'19).
 
-A target is an object in an image with ``inst_count`` instances to localise. Targets are handled as one batch, padded
-to the largest number of estimates and annotations.
+A target is an object in an image with ``inst_count`` instances to localise.
 """
 
-from typing import NamedTuple
+import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 
-class Ranking(NamedTuple):
-    """The best entries of N padded lists.
-
-    Attributes:
-        order: (N, n) int64, indices of the entries, best first; equal ones in the order given, padding last.
-        counted: (N, n) bool, the entry at this place of ``order`` is among the ``count`` best.
-    """
-
-    order: Tensor
-    counted: Tensor
-
-
-def best_first(values: Tensor, exists: Tensor, count: Tensor) -> Ranking:
-    """Sort padded lists and mark the best entries of each: the estimates of a target that are evaluated.
-
-    Args:
-        values: (N, n), the higher the better; NaN is worse than any number.
-        exists: (N, n) bool, which entries are no padding.
-        count: (N,) integers, how many to mark in each list.
-
-    Returns:
-        The ranking.
-
-    Raises:
-        ValueError: wrong shapes.
-
-    Differentiable w.r.t. nothing.
-    """
-    if values.dim() != 2 or exists.shape != values.shape or count.shape != values.shape[:1]:
-        raise ValueError(
-            "values and exists must have shape (N, n) and count (N,), got "
-            f"{tuple(values.shape)}, {tuple(exists.shape)} and {tuple(count.shape)}"
-        )
-    worst = torch.where(values.isnan(), -torch.inf, values.detach())
-    order = worst.sort(dim=1, descending=True, stable=True).indices
-    # A second stable sort, so that padding comes even after an entry of value -inf.
-    last = (~exists).gather(1, order).byte().sort(dim=1, stable=True).indices
-    order = order.gather(1, last)
-    place = torch.arange(values.shape[1], device=values.device)
-    return Ranking(order, exists.gather(1, order) & (place < count[:, None]))
-
-
-def most_visible(visibility: Tensor, exists: Tensor, count: Tensor) -> Tensor:
-    """Annotations that are to be found: the ``count`` most visible of each target, equal ones in the order given.
-
-    Args:
-        visibility: (N, g) visible share of each annotated instance.
-        exists: (N, g) bool, which entries are no padding.
-        count: (N,) integers, instances of the target.
-
-    Returns:
-        (N, g) bool, in the order given.
-
-    Raises:
-        ValueError: wrong shapes.
-    """
-    ranking = best_first(visibility, exists, count)
-    return torch.zeros_like(ranking.counted).scatter(1, ranking.order, ranking.counted)
+def best(values: Sequence[float], count: int | None) -> list[int]:
+    """Indices of the ``count`` highest values (None: all), best first; equal ones in the order given, NaN last."""
+    return sorted(range(len(values)), key=lambda i: math.inf if math.isnan(values[i]) else -values[i])[:count]
 
 
 def greedy_matches(errors: Tensor, thresholds: Tensor, valid: Tensor | None = None) -> Tensor:

@@ -10,9 +10,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from foundpose.bop.files import BopError, describe_folder
+from foundpose.bop.files import BopError
+from foundpose.bop.matching import best
+from foundpose.bop.scenes import check_rotation
 from foundpose.bop.targets import Target, describe_target
-from foundpose.utils.files import write_atomically
+from foundpose.utils.files import describe_folder, write_atomically
 
 HEADER = ["scene_id", "im_id", "obj_id", "score", "R", "t", "time"]
 # Seconds by which the times of an image's results may differ in the benchmark's own check.
@@ -142,6 +144,7 @@ def _parse_row(fields: list[str]) -> PoseResult:
     T = torch.eye(4, dtype=torch.float64)
     T[:3, :3] = torch.tensor(R, dtype=torch.float64).reshape(3, 3)
     T[:3, 3] = torch.tensor(t, dtype=torch.float64)
+    check_rotation(T[:3, :3], "R")
     return PoseResult(int(fields[0]), int(fields[1]), int(fields[2]), score, T, time)
 
 
@@ -163,18 +166,16 @@ def best_of_targets(
     """
     if len(keys) != len(scores):
         raise ValueError(f"keys and scores must be equally many, got {len(keys)} and {len(scores)}")
-    if any(math.isnan(score) for score in scores):
-        raise ValueError(
-            f"scores must be numbers, score {[math.isnan(s) for s in scores].index(True)} is NaN"
-        )
+    if any(map(math.isnan, scores)):
+        raise ValueError(f"scores must be numbers, score {[*map(math.isnan, scores)].index(True)} is NaN")
     found: dict[tuple[int, int, int | None], list[int]] = defaultdict(list)
     for i, (scene_id, im_id, obj_id) in enumerate(keys):
         found[scene_id, im_id, obj_id].append(i)
         found[scene_id, im_id, None].append(i)
-    kept = set()
+    kept: set[int] = set()
     for target in targets:
-        # A stable sort: equal scores keep their order.
-        kept.update(sorted(found[target[:3]], key=lambda i: -scores[i])[: target.inst_count])
+        mine = found[target[:3]]
+        kept.update(mine[i] for i in best([scores[i] for i in mine], target.inst_count))
     return sorted(kept)
 
 

@@ -57,6 +57,22 @@ def parse_depth_scale(entry: Any, where: str) -> float:
     return scale
 
 
+def check_rotation(R: Tensor, name: str) -> None:
+    """Raise BopError unless a matrix (3, 3) is a rotation, whose scale may be off by 2 %; say what it is instead."""
+    scales = torch.linalg.svdvals(R)
+    reflection = bool(torch.linalg.det(R) < 0)
+    if bool(((scales - 1).abs() <= ROTATION_TOLERANCE).all()) and not reflection:
+        return
+    if scales[0] - scales[2] > ROTATION_TOLERANCE * scales[0]:
+        fault = f"its axes are not orthogonal (singular values {[round(x, 4) for x in scales.tolist()]})"
+    else:
+        fault = f"it is {'a reflection' if reflection else 'a rotation'} scaled by {float(scales.mean()):.4g}"
+    raise BopError(
+        f"{name} must be a rotation, row by row (its scale may be off by {ROTATION_TOLERANCE:.0%}), {fault}; got "
+        f"{R.tolist()}"
+    )
+
+
 def parse_annotations(entries: Any, infos: Any, where: str) -> list[Annotation]:
     """Annotations of one image.
 
@@ -82,13 +98,7 @@ def parse_annotations(entries: Any, infos: Any, where: str) -> list[Annotation]:
         name = f"{where}, annotation {index}"
         T[index, :3, :3] = _numbers(entry, "cam_R_m2c", 9, name).reshape(3, 3)
         T[index, :3, 3] = _numbers(entry, "cam_t_m2c", 3, name)
-    R = T[:, :3, :3]
-    off = (torch.linalg.svdvals(R) - 1).abs().amax(dim=-1)
-    for index in torch.nonzero((off > ROTATION_TOLERANCE) | (torch.linalg.det(R) < 0)).flatten().tolist():
-        raise BopError(
-            f"{where}, annotation {index}: cam_R_m2c must be a rotation, row by row (its scale may be off by "
-            f"{ROTATION_TOLERANCE:.0%}), got {R[index].tolist()}"
-        )
+        check_rotation(T[index, :3, :3], f"{name}: cam_R_m2c")
     return [
         Annotation(
             _object_id(entry, f"{where}, annotation {i}"),

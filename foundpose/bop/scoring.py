@@ -13,9 +13,10 @@ from foundpose.bop.localization import Localization, localization
 from foundpose.bop.matching import greedy_matches
 from foundpose.bop.results import PoseResult
 from foundpose.bop.scores import AVERAGED, FunctionScores, Recall, Scores
-from foundpose.bop.targets import Target
-from foundpose.bop.vsd_image import DepthObject, PosedObject, vsd_of_pairs
+from foundpose.bop.targets import Target, describe_target
+from foundpose.bop.vsd_image import DepthImage, DepthObject, PosedObject, vsd_of_pairs
 from foundpose.rendering.mesh_io import read_mesh_file
+from foundpose.utils.units import check_unit
 
 FRACTIONS = tuple(0.05 + 0.05 * k for k in range(10))  # to the last bit those of the toolkit
 """Thresholds of MSSD in diameters, of VSD, and VSD's misalignment tolerances in diameters."""
@@ -70,6 +71,7 @@ def score_results(
     Raises:
         ValueError: an unknown error function.
         BopError: no ground truth, no models for evaluation, no targets.
+        UnitError: meshes, poses, estimates or depth are not in one unit.
         FileNotFoundError: a file of the dataset is missing.
 
     Differentiable w.r.t. nothing.
@@ -81,6 +83,7 @@ def score_results(
             f"{dataset.models_eval} holds no models_info.json: errors need the models for evaluation"
         )
     tables = localization(dataset, results, targets)
+    _check_units(dataset, tables)
     not_computed = {name: "not asked for" for name in AVERAGED if name not in errors}
     computed: dict[str, Tensor] = {}
     wanted = [name for name in THRESHOLDS if name in errors and name != "vsd"]
@@ -99,6 +102,22 @@ def score_results(
         facts["vsd_delta"] = dataset.vsd_delta
     instances = dict(zip(tables.object_ids, counts.tolist(), strict=True))
     return Scores(facts, instances, functions, not_computed)
+
+
+def _check_units(dataset: BopDataset, tables: Localization) -> None:
+    """Raise UnitError where poses and meshes, or estimates and truth, are hardly in one unit."""
+    if not len(tables.T_true):
+        return
+    diameters = [float(dataset.evaluation_info(obj_id)["diameter"]) for obj_id in tables.object_ids]
+    true = float(tables.T_true[:, :3, 3].norm(dim=1).median())
+    size = 10.0 * float(torch.tensor(diameters).median())
+    # A camera sees objects from between a tenth of a diameter and a thousand.
+    check_unit(
+        true, f"the median distance in {dataset.split}", size, "ten times the diameter in models_info.json"
+    )
+    if len(tables.T_est):
+        estimated = float(tables.T_est[:, :3, 3].norm(dim=1).median())
+        check_unit(estimated, "the median distance of the estimates", true, "that of the ground truth")
 
 
 def check_functions(errors: Sequence[str]) -> None:
@@ -197,17 +216,16 @@ def vsd_errors(
             sides.append((posed, place))
         (estimates, est_place), (truths, true_place) = sides
         where = tables.images[image]
-        values = vsd_of_pairs(
-            estimates,
-            truths,
-            torch.stack([est_place, true_place], dim=1),
-            dataset.depth(*where),
-            dataset.intrinsics(*where),
-            FRACTIONS,
-            dataset.vsd_delta,
-            device,
+        seen = DepthImage(dataset.depth(*where), dataset.intrinsics(*where))
+        distance = float(torch.stack([posed.T_camera_from_model[2, 3] for posed in truths]).median())
+        if bool((seen.depth > 0).any()):
+            measured = float(seen.depth[seen.depth > 0].median())
+            name = f"the median depth of {describe_target(*where)} with its depth_scale"
+            check_unit(measured, name, distance, "that of its objects")
+        places = torch.stack([est_place, true_place], dim=1)
+        errors[target, :, i, j] = vsd_of_pairs(
+            estimates, truths, places, seen, FRACTIONS, dataset.vsd_delta, device
         )
-        errors[target, :, i, j] = values
         if progress is not None:
             progress("VSD", done, len(images))
     return errors

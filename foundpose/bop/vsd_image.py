@@ -66,12 +66,23 @@ class PosedObject(NamedTuple):
     T_camera_from_model: Tensor
 
 
+class DepthImage(NamedTuple):
+    """What a depth camera measured.
+
+    Attributes:
+        depth: (H, W) z of the surface in mesh units, 0 without measurement.
+        K: (3, 3) intrinsics, pixels.
+    """
+
+    depth: Tensor
+    K: Tensor
+
+
 def vsd_of_pairs(
     estimates: Sequence[PosedObject],
     truths: Sequence[PosedObject],
     pairs: Tensor,
-    depth: Tensor,
-    K: Tensor,
+    image: DepthImage,
     taus: Sequence[float],
     delta: float = BOP_DELTA,
     device: torch.device | str = "cpu",
@@ -82,8 +93,7 @@ def vsd_of_pairs(
         estimates: E objects at estimated poses.
         truths: A objects at true poses.
         pairs: (P, 2) integers: which estimate against which truth, both of the same object.
-        depth: (H, W) measured depth, 0 without measurement, in mesh units.
-        K: (3, 3) intrinsics, pixels.
+        image: what was measured.
         taus: misalignment tolerances, shares of the diameter.
         delta: visibility tolerance, mesh units.
         device: where the images are compared; rays are cast on the CPU's cores.
@@ -93,6 +103,7 @@ def vsd_of_pairs(
 
     Differentiable w.r.t. nothing.
     """
+    depth, K = image
     size = (int(depth.shape[0]), int(depth.shape[1]))
     views = [
         [item.object.view(item.T_camera_from_model, K, size) for item in side] for side in (estimates, truths)

@@ -49,17 +49,9 @@ def pixel_offsets(est: Tensor, true: Tensor, points: Tensor) -> Tensor:
     return _project(_map(est, points)) - _project(_map(true, points))
 
 
-def working_bytes(vertices: Tensor, chunk_bytes: int | None) -> int:
-    """Memory to work with: what was asked for, else what suits the device of the vertices.
-
-    Raises:
-        ValueError: ``chunk_bytes`` is not positive.
-    """
-    if chunk_bytes is None:
-        return 2**22 if vertices.device.type == "cpu" else 2**28
-    if chunk_bytes < 1:
-        raise ValueError(f"chunk_bytes must be positive, got {chunk_bytes}")
-    return chunk_bytes
+def working_bytes(vertices: Tensor) -> int:
+    """About how much memory to work with at a time: on the CPU what fits into its cache."""
+    return 2**22 if vertices.device.type == "cpu" else 2**28
 
 
 def slices(count: int, bytes_each: int, budget: int) -> Iterator[slice]:

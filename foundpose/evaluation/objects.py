@@ -14,6 +14,7 @@ from foundpose.onboarding.onboarder import Progress
 from foundpose.rendering import Mesh, load_mesh
 from foundpose.representation import ObjectRepresentation
 from foundpose.utils.files import write_json
+from foundpose.utils.units import check_unit
 
 MIB = 2**20
 
@@ -55,16 +56,13 @@ class DatasetObjects:
         """Mesh of an object.
 
         Raises:
-            ValueError: its size and the dataset's entry for it disagree by more than a factor of two.
+            UnitError: its size and the dataset's entry for it disagree by more than a factor of two.
         """
         if obj_id not in self._meshes:
             path = self.dataset.mesh_path(obj_id)
             mesh = load_mesh(path)
-            if not 0.5 < mesh.diameter / self.dataset.diameter(obj_id) < 2.0:
-                raise ValueError(
-                    f"{path} has a diameter of {mesh.diameter:.4g}, models_info.json says "
-                    f"{self.dataset.diameter(obj_id):.4g}: are they in the same unit?"
-                )
+            published = self.dataset.diameter(obj_id)
+            check_unit(mesh.diameter, f"the diameter of {path}", published, "that in models_info.json", 2.0)
             self._meshes[obj_id] = mesh
         self._meshes.move_to_end(obj_id)
         if self.mesh_limit is not None:
@@ -74,13 +72,9 @@ class DatasetObjects:
                 taken -= _mesh_size(dropped)
         return self._meshes[obj_id]
 
-    def name(self, obj_id: int) -> str:
-        """Name of an object's representation."""
-        return f"{self.dataset.name}-{obj_id:06d}"
-
     def path(self, obj_id: int) -> Path:
         """File of an object's representation, whether it exists or not."""
-        return self.store.path_of(self._checksum(obj_id), self.name(obj_id))
+        return self.store.path_of(self._checksum(obj_id), self.dataset.object_name(obj_id))
 
     def onboard(self, ids: Iterable[int], progress: Callable[[str], Progress] | None = None) -> None:
         """Make the representations that are not in the store yet.
@@ -91,7 +85,7 @@ class DatasetObjects:
         """
         for obj_id in ids:
             if not self.path(obj_id).is_file():
-                name = self.name(obj_id)
+                name = self.dataset.object_name(obj_id)
                 self.store.get(self.mesh(obj_id), name, None if progress is None else progress(name))
         self._checksums.write()
 
@@ -123,9 +117,9 @@ class DatasetObjects:
             while self._loaded and needed + self.loaded_size() > self.memory_limit:
                 self._loaded.popitem(last=False)
         for obj_id in missing:
-            found = self.store.find(self._checksum(obj_id), self.name(obj_id))
+            found = self.store.find(self._checksum(obj_id), self.dataset.object_name(obj_id))
             if found is None:
-                found = self.store.get(self.mesh(obj_id), self.name(obj_id))
+                found = self.store.get(self.mesh(obj_id), self.dataset.object_name(obj_id))
             self._loaded[obj_id] = found
         return [self._loaded[obj_id].to(device) for obj_id in ids]
 

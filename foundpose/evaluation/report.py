@@ -1,16 +1,18 @@
 """What an evaluation leaves behind: all estimates, and where the time went."""
 
 import platform
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from foundpose.bop import Instance
+from foundpose.bop import Instance, PoseResult, Target
+from foundpose.bop.targets import describe_target
 from foundpose.evaluation.records import add_image_times
 from foundpose.evaluation.shards import BatchRecord, read_shards
+from foundpose.pipeline.results import PoseStatus
 
 
 def merge_shards(folder: Path, batches: Sequence[Sequence[Instance]]) -> list[BatchRecord]:
@@ -37,6 +39,61 @@ def all_records(batches: Sequence[BatchRecord]) -> list[dict[str, Any]]:
     records = [record for batch in batches for record in batch.records]
     add_image_times(records)
     return sorted(records, key=lambda record: (record["scene_id"], record["im_id"], record["obj_id"]))
+
+
+def unanswered(
+    targets: Sequence[Target], results: Sequence[PoseResult], records: Sequence[dict[str, Any]] | None
+) -> list[dict[str, Any]]:
+    """Targets with fewer estimates than instances.
+
+    Args:
+        targets: what was to be found.
+        results: the estimates.
+        records: what became of every detection; None where the estimates came from a file.
+
+    Returns:
+        For each its ids, the number of ``instances`` without estimate, and the ``reason``. A target that is an image
+        (bop24) is one instance.
+    """
+    found: Counter[tuple[int, int, int | None]] = Counter()
+    for result in results:
+        found.update([(result.scene_id, result.im_id, result.obj_id), (result.scene_id, result.im_id, None)])
+    states: dict[tuple[int, int, int | None], list[str]] = defaultdict(list)
+    for record in records or ():
+        for obj_id in (record["obj_id"], None):
+            states[record["scene_id"], record["im_id"], obj_id].append(record["status"])
+    missing = []
+    for target in targets:
+        instances = (target.inst_count or 1) - found[target[:3]]
+        if instances <= 0:
+            continue
+        tried = states[target[:3]]
+        failed = sorted({status for status in tried if status != PoseStatus.OK.name})
+        if records is None:
+            reason = "not in the results file"
+        elif failed:
+            reason = f"no pose ({', '.join(failed)})"
+        else:
+            reason = "too few detections" if tried else "no detection"
+        ids = dict(zip(("scene_id", "im_id", "obj_id"), target[:3], strict=True))
+        missing.append(ids | {"instances": instances, "reason": reason})
+    return missing
+
+
+def in_words(missing: Sequence[dict[str, Any]], most: int = 3) -> str:
+    """A line for each reason of :func:`unanswered`, with the first few targets."""
+    if not missing:
+        return "every target has its estimates"
+    by_reason: dict[str, list[dict[str, Any]]] = defaultdict(list)
+    for entry in missing:
+        by_reason[entry["reason"]].append(entry)
+    lines = []
+    for reason, entries in by_reason.items():
+        names = [describe_target(e["scene_id"], e["im_id"], e["obj_id"]) for e in entries[:most]]
+        more = f" and {len(entries) - most} more targets in scores.json" if len(entries) > most else ""
+        count = sum(entry["instances"] for entry in entries)
+        lines.append(f"{count} instances without estimate, {reason}: {', '.join(names)}{more}")
+    return "\n".join(lines)
 
 
 def timing(batches: Sequence[BatchRecord], device: torch.device | str) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 import logging
 import warnings
 from pathlib import Path
+from typing import Any
 
 import pytorch_lightning as pl
 from hydra.utils import instantiate
@@ -20,12 +21,12 @@ from foundpose.bop import (
     score_results,
     write_results,
 )
-from foundpose.config import MAY_CHANGE, build_method, claim_run_folder, wanted_objects
+from foundpose.config import build_method, claim_run_folder, wanted_objects
 from foundpose.evaluation.data import PoseDataModule
 from foundpose.evaluation.module import PoseEvaluation, estimate_dataset
 from foundpose.evaluation.objects import DatasetObjects
 from foundpose.evaluation.records import best_results, to_results
-from foundpose.evaluation.report import all_records, merge_shards, timing
+from foundpose.evaluation.report import all_records, in_words, merge_shards, timing, unanswered
 from foundpose.utils.files import write_json
 from foundpose.utils.progress import ProgressBars
 
@@ -49,22 +50,25 @@ def run_evaluation(cfg: DictConfig, output: Path) -> Scores | None:
     check_functions(list(cfg.errors))
     dataset: BopDataset = instantiate(cfg.data)
     wanted = wanted_objects(cfg, dataset)
+    records = None
     if cfg.results is not None:
         results = read_results(cfg.results)
         check_times(results)
     else:
-        estimated = _estimate(cfg, dataset, wanted, output)
-        if estimated is None:
+        records = _estimate(cfg, dataset, wanted, output)
+        if records is None:
             return None
-        results = estimated
-    return _score(cfg, dataset, results, wanted, output)
+        results = best_results(to_results(records), dataset.targets())
+        path = output / result_file_name(cfg.method, dataset.name, cfg.data.split)
+        write_results(path, results)
+        print(f"{len(records)} instances, {sum(r['valid'] for r in records)} with a pose; written to {path}")
+    return _score(cfg, dataset, results, records, wanted, output)
 
 
 def _estimate(
     cfg: DictConfig, dataset: BopDataset, wanted: list[int], output: Path
-) -> list[PoseResult] | None:
-    """The poses that are handed in, in the first process; None in the others."""
-    path = output / result_file_name(cfg.method, dataset.name, cfg.data.split)
+) -> list[dict[str, Any]] | None:
+    """Records of all instances, in the first process; None in the others."""
     masks = instantiate(cfg.masks)
     method = build_method(cfg)
     objects = DatasetObjects(dataset, method.store, cfg.memory_limit)
@@ -79,7 +83,7 @@ def _estimate(
         max_images=cfg.max_images,
     )
     found = data.instances
-    claim_run_folder(output, cfg, MAY_CHANGE)
+    claim_run_folder(output, cfg)
     logging.getLogger("pytorch_lightning.utilities.rank_zero").setLevel(logging.WARNING)
     trainer: pl.Trainer = instantiate(cfg.trainer, default_root_dir=output)
     module: PoseEvaluation = instantiate(
@@ -98,10 +102,7 @@ def _estimate(
     write_json(output / "memory.json", memory(objects, sorted({i.obj_id for i in found})))
     records = all_records(done)
     write_json(output / "estimates.json", records)
-    results = best_results(to_results(records), dataset.targets())
-    write_results(path, results)
-    print(f"{len(records)} instances, {sum(r['valid'] for r in records)} with a pose; written to {path}")
-    return results
+    return records
 
 
 def memory(objects: DatasetObjects, ids: list[int]) -> dict[str, dict[str, int]]:
@@ -110,32 +111,40 @@ def memory(objects: DatasetObjects, ids: list[int]) -> dict[str, dict[str, int]]
 
 
 def _score(
-    cfg: DictConfig, dataset: BopDataset, results: list[PoseResult], wanted: list[int], output: Path
+    cfg: DictConfig,
+    dataset: BopDataset,
+    results: list[PoseResult],
+    records: list[dict[str, Any]] | None,
+    wanted: list[int],
+    output: Path,
 ) -> Scores | None:
-    """Write scores.json and print the table; a split without ground truth has no scores."""
+    """Write scores.json and print the table, and what has no estimate; a split without ground truth has no scores."""
     scenes = sorted({scene_id for scene_id, _ in dataset.images()})
     without = [scene_id for scene_id in scenes if not dataset.has_ground_truth(scene_id)]
     if without:
         reason = f"{len(without)} of {len(scenes)} scenes in {dataset.split} have no scene_gt.json"
-        write_json(output / "scores.json", {"computed": False, "reason": reason})
+        missing = unanswered(_targets(cfg, dataset.targets(), dataset, wanted), results, records)
+        content = {"computed": False, "reason": reason, "without_estimate": missing}
+        write_json(output / "scores.json", content)
         print(f"no scores: {reason}")
+        print(in_words(missing))
         return None
+    targets = _targets(cfg, dataset.localization_targets(), dataset, wanted)
     scores = score_results(
         dataset,
         results,
         errors=tuple(cfg.errors),
-        targets=_targets(cfg, dataset, wanted),
+        targets=targets,
         progress=ProgressBars("score"),
     )
-    write_json(output / "scores.json", scores.to_json())
+    missing = unanswered(targets, results, records)
+    write_json(output / "scores.json", scores.to_json() | {"without_estimate": missing})
     print(scores.table())
+    print(in_words(missing))
     return scores
 
 
-def _targets(cfg: DictConfig, dataset: BopDataset, wanted: list[int]) -> list[Target] | None:
-    """The part of the targets that a run is about; None for all."""
-    if cfg.objects is None and cfg.max_images is None:
-        return None
+def _targets(cfg: DictConfig, targets: list[Target], dataset: BopDataset, wanted: list[int]) -> list[Target]:
+    """The part of the targets that a run is about."""
     images = set(dataset.images()[: cfg.max_images])
-    targets = dataset.localization_targets()
-    return [t for t in targets if t.obj_id in wanted and (t.scene_id, t.im_id) in images]
+    return [t for t in targets if t.obj_id in (None, *wanted) and (t.scene_id, t.im_id) in images]

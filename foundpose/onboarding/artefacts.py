@@ -1,6 +1,5 @@
 """A folder of intermediate results that many jobs share, each named by what it depends on."""
 
-import hashlib
 import json
 import zlib
 from collections import Counter
@@ -16,6 +15,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from foundpose.utils.files import write_atomically
+from foundpose.utils.settings import digest
 
 ARTEFACT_VERSION = 1
 
@@ -86,8 +86,7 @@ class ArtefactStore:
     @staticmethod
     def key(kind: str, facts: Mapping[str, Any]) -> str:
         """sha256 of a kind and of facts that JSON can hold; the order of the facts does not matter."""
-        content = json.dumps([ARTEFACT_VERSION, kind, facts], sort_keys=True)
-        return hashlib.sha256(content.encode()).hexdigest()
+        return digest([ARTEFACT_VERSION, kind, facts])
 
     def path(self, kind: str, facts: Mapping[str, Any]) -> Path:
         """File of an artefact, whether it exists or not."""

@@ -1,4 +1,4 @@
-"""Templates as 8-bit or 16-bit pictures, and their lossless compression."""
+"""Templates as 8-bit or 16-bit pictures, and their lossless compression: Pillow writes no RGB of 16 bits."""
 
 import zlib
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """A folder of object representations."""
 
-import hashlib
-import json
 from pathlib import Path
 
 from foundpose.onboarding.artefacts import ArtefactStore, load_or_make
@@ -10,6 +8,7 @@ from foundpose.onboarding.onboarder import Onboarder
 from foundpose.onboarding.stages import Progress
 from foundpose.rendering import Mesh
 from foundpose.representation.object_representation import SCHEMA_VERSION, ObjectRepresentation
+from foundpose.utils.settings import digest
 
 
 class RepresentationStore:
@@ -56,8 +55,7 @@ class RepresentationStore:
             "precision": self.onboarder.extractor.running_precision(),
             "settings": self.onboarder.settings(),
         }
-        digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
-        return self.folder / f"{name}-{digest[:12]}.safetensors"
+        return self.folder / f"{name}-{digest(facts)[:12]}.safetensors"
 
     def has(self, mesh: Mesh, name: str) -> bool:
         """Whether the object is onboarded already."""

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
+import psutil
 import torch
 
 BatchSize = int | Literal["auto"]
@@ -15,7 +16,6 @@ _LIMITS = {"cuda": 64, "cpu": 16}
 """Beyond these, more samples at a time make none of them faster."""
 _TRIALS = (1, 2)
 _STATUS, _RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
-_MEMINFO = Path("/proc/meminfo")
 _CGROUP, _CGROUPS = Path("/proc/self/cgroup"), Path("/sys/fs/cgroup")
 
 
@@ -70,21 +70,27 @@ def peak_memory(run: Callable[[int], object], samples: int, device: torch.device
         torch.cuda.synchronize(device)
         return torch.cuda.max_memory_allocated(device) - before
     _RESET.write_text("5")  # sets the peak to what is resident now
-    before = _kilobytes(_STATUS, "VmRSS")
+    before = psutil.Process().memory_info().rss
     run(samples)
-    return 1024 * max(_kilobytes(_STATUS, "VmHWM") - before, 0)
+    # psutil has no peak that can be set back.
+    peak = re.search(r"^VmHWM:\s+(\d+) kB", _STATUS.read_text(), re.MULTILINE)
+    assert peak is not None
+    return max(1024 * int(peak.group(1)) - before, 0)
 
 
 def free_memory(device: torch.device) -> int:
-    """Bytes that this process could still take on a CUDA device or under Linux, cgroup limits included."""
+    """Bytes that this process could still take on a CUDA device or on the CPU, cgroup limits included."""
     if device.type == "cuda":
         free, _ = torch.cuda.mem_get_info(device)
         return free + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
-    return min([1024 * _kilobytes(_MEMINFO, "MemAvailable"), *_room_in_cgroups()])
+    return min([psutil.virtual_memory().available, *_room_in_cgroups()])
 
 
 def _room_in_cgroups() -> list[int]:
-    """Bytes that each of the control groups around this process (a container, a Slurm job) leaves."""
+    """Bytes that each of the control groups around this process (a container, a Slurm job) leaves.
+
+    psutil knows of the whole machine alone, and a job that takes more than its group may have is killed.
+    """
     found = re.search(r"^0::/(.*)$", _CGROUP.read_text() if _CGROUP.is_file() else "", re.MULTILINE)
     if found is None:
         return []
@@ -95,11 +101,3 @@ def _room_in_cgroups() -> list[int]:
         if limit.is_file() and (most := limit.read_text().strip()) != "max":
             rooms.append(max(int(most) - int((group / "memory.current").read_text()), 0))
     return rooms
-
-
-def _kilobytes(path: Path, name: str) -> int:
-    """An entry of one of Linux's tables of sizes."""
-    found = re.search(rf"^{name}:\s+(\d+) kB", path.read_text(), re.MULTILINE)
-    if found is None:
-        raise ValueError(f"{path} has no entry {name}; give a batch_size as a number")
-    return int(found.group(1))

@@ -13,6 +13,17 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 
+def describe_folder(folder: Path, most: int = 12) -> str:
+    """Say in words what a folder holds."""
+    if not folder.is_dir():
+        return f"the folder {folder} does not exist"
+    names = sorted(entry.name + ("/" if entry.is_dir() else "") for entry in folder.iterdir())
+    if not names:
+        return f"the folder {folder} is empty"
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return f"{folder} holds {', '.join(names[:most])}{more}"
+
+
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     """Let ``write`` fill a temporary file in the folder of ``path``, then rename it to ``path``.
 
@@ -38,9 +49,14 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
         temporary.unlink(missing_ok=True)
 
 
+def write_text(path: Path, text: str) -> None:
+    """Write text, whole or not at all."""
+    write_atomically(path, lambda temporary: temporary.write_text(text))
+
+
 def write_json(path: Path, content: Any) -> None:
     """Write JSON, whole or not at all."""
-    write_atomically(path, lambda temporary: temporary.write_text(json.dumps(content, indent=1)))
+    write_text(path, json.dumps(content, indent=1))
 
 
 def save_weights(path: Path, module: nn.Module, header: str, facts: dict[str, Any]) -> None:

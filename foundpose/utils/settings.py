@@ -1,6 +1,9 @@
 """What modules say of their settings: what files on disk are named after."""
 
+import hashlib
+import json
 from abc import ABC, abstractmethod
+from typing import Any
 
 from torch import nn
 
@@ -35,3 +38,8 @@ def identity(module: nn.Module) -> str:
         )
     text = ", ".join(f"{key}={value!r}" for key, value in settings().items())
     return f"{type(module).__name__}({text})"
+
+
+def digest(facts: Any) -> str:
+    """sha256 of facts that JSON can hold; the order of the facts does not matter."""
+    return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()

@@ -241,7 +241,7 @@ def test_laws(seed, name):
 
 
 @pytest.mark.parametrize("name", ENTRIES)
-def test_neighbours_and_chunks_do_not_matter(name):
+def test_neighbours_and_chunks_do_not_matter(name, monkeypatch):
     vertices = vase()
     model = ModelErrors.from_models_info(vertices, ENTRIES[name], step=0.05)
     T_est, T_true = pose_pairs(12)
@@ -254,12 +254,12 @@ def test_neighbours_and_chunks_do_not_matter(name):
     ]
     torch.testing.assert_close(torch.cat(alone, dim=1), together, rtol=1e-12, atol=1e-12)
     for chunk_bytes in (1, 300_000, 10**9):
-        other = ModelErrors.from_models_info(vertices, ENTRIES[name], step=0.05, chunk_bytes=chunk_bytes)
+        monkeypatch.setattr("foundpose.bop.errors.working_bytes", lambda _, budget=chunk_bytes: budget)
         # One row at a time is slow for the nearest points.
         some = slice(0, 2) if chunk_bytes == 1 else slice(None)
         pairs = T_est[some], T_true[some]
         torch.testing.assert_close(
-            torch.stack([*other(*pairs, K), other.add_s(*pairs)]), together[:, some], rtol=1e-12, atol=1e-12
+            torch.stack([*model(*pairs, K), model.add_s(*pairs)]), together[:, some], rtol=1e-12, atol=1e-12
         )
     nothing = model(T_est[:0], T_true[:0], K)
     assert nothing.mssd.shape == nothing.mspd.shape == model.add_s(T_est[:0], T_true[:0]).shape == (0,)
@@ -360,13 +360,14 @@ class LargestTensor(TorchDispatchMode):
 
 
 @pytest.mark.parametrize("chunk_bytes", [2**21, 2**23])
-def test_memory_is_bounded(chunk_bytes):
-    model = ModelErrors.from_models_info(body(subdivisions=4), ENTRIES["both"], chunk_bytes=chunk_bytes)
+def test_memory_is_bounded(chunk_bytes, monkeypatch):
+    monkeypatch.setattr("foundpose.bop.errors.working_bytes", lambda _: chunk_bytes)
+    model = ModelErrors.from_models_info(body(subdivisions=4), ENTRIES["both"])
     assert len(model.symmetries) == 630
     pairs = pose_pairs(200)
     with LargestTensor() as largest:
         model(*pairs, K)
-        adi(pairs[0][:2], pairs[1][:2], model.vertices, chunk_bytes)
+        adi(pairs[0][:2], pairs[1][:2], model.vertices)
     # All at once would be 200 × 630 × 3 × 2562 numbers.
     assert chunk_bytes / 4 < largest.bytes <= chunk_bytes
 
@@ -436,8 +437,6 @@ def test_bad_input_is_named():
         (lambda: mssd(T, T, vertices.half()), "float32 or float64, got torch.float16"),
         (lambda: mssd(T, T, vertices, T[:0]), r"symmetries must be \(S, 4, 4\)"),
         (lambda: mssd(T, T, vertices, T.float()), "symmetries must be torch.float64"),
-        (lambda: mssd(T, T, vertices, chunk_bytes=0), "chunk_bytes must be positive, got 0"),
-        (lambda: ModelErrors(vertices, chunk_bytes=-1), "chunk_bytes must be positive, got -1"),
         (lambda: ModelErrors(vertices * math.nan), "must be finite"),
         (lambda: ModelErrors(vertices, T * math.inf), "must be finite"),
         (

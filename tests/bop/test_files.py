@@ -9,7 +9,7 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from PIL import Image
 
-from foundpose.bop import BopError, Target, read_depth, read_image, read_mask
+from foundpose.bop import PictureError, Target, read_depth, read_image, read_mask
 from foundpose.bop.files import JsonCache
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
@@ -47,19 +47,21 @@ def test_pictures_of_all_kinds(tmp_path, rng):
     }.items():
         Image.fromarray(array).save(tmp_path / name)
         expected = pixels[..., :3] if name.startswith("rgb") else np.repeat(pixels[..., :1], 3, -1)
+        if name == "rgba.png":
+            expected = expected * (pixels[..., 3:] / 255.0)
         got = read_image(tmp_path / name)
         assert torch.allclose(got, torch.from_numpy(expected / 255.0).permute(2, 0, 1).float(), atol=1e-6), (
             name
         )
     (tmp_path / "text.png").write_text("no picture")
-    with pytest.raises(BopError, match="not a readable image"):
+    with pytest.raises(PictureError, match="not a readable image"):
         read_image(tmp_path / "text.png")
     with pytest.raises(FileNotFoundError, match=r"no image at .* holds deep\.png"):
         read_image(tmp_path / "missing.png")
-    with pytest.raises(BopError, match=r"is 7x5 px, its image 8x5 px"):
+    with pytest.raises(PictureError, match=r"is 7x5 px, its image 8x5 px"):
         read_mask(tmp_path / "grey.png", (5, 8))
     Image.fromarray(np.zeros((5, 7), np.uint8)).save(tmp_path / "black.png")
-    with pytest.raises(BopError, match=r"is empty: .* brightest is 0 of 255"):
+    with pytest.raises(PictureError, match=r"is empty: .* brightest is 0 of 255"):
         read_mask(tmp_path / "black.png")
 
 
@@ -70,13 +72,13 @@ def test_depth_images_of_all_kinds(tmp_path, rng):
         got = read_depth(tmp_path / name, 0.1, (5, 7))
         assert got.dtype == torch.float32
         assert np.array_equal(got.numpy(), values.astype(np.float32) * np.float32(0.1))
-    with pytest.raises(BopError, match=r"depth image .*depth.tif is 7x5 px, its image 7x6 px"):
+    with pytest.raises(PictureError, match=r"depth image .*depth.tif is 7x5 px, its image 7x6 px"):
         read_depth(tmp_path / "depth.tif", 1.0, (6, 7))
     Image.fromarray((values >> 8).astype(np.uint8)).save(tmp_path / "byte.png")
-    with pytest.raises(BopError, match=r"one channel of 16 bit \(got uint8"):
+    with pytest.raises(PictureError, match=r"one channel of 16 bit \(its mode is 'L'"):
         read_depth(tmp_path / "byte.png", 1.0)
     Image.fromarray(np.full((5, 7), -1, np.int32)).save(tmp_path / "minus.tif")
-    with pytest.raises(BopError, match="negative or not finite"):
+    with pytest.raises(PictureError, match="negative or not finite"):
         read_depth(tmp_path / "minus.tif", 1.0)
 
 

@@ -6,9 +6,8 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torch.nn.utils.rnn import pad_sequence
 
-from foundpose.bop.matching import best_first, greedy_matches, most_visible
+from foundpose.bop.matching import best, greedy_matches
 
 
 def plain_match(errors, counted, valid, threshold):
@@ -30,29 +29,26 @@ def batched_match(tables, thresholds):
     Returns counted estimates and valid annotations of each table, and (N, T, g) matched estimates as given.
     """
 
-    def pad(rows, fill):
-        rows = [torch.tensor(row, dtype=torch.float64) for row in rows]
-        return pad_sequence(rows, batch_first=True, padding_value=fill)
-
-    # One more column, so that there is padding even where no table has an estimate.
-    scores = torch.nn.functional.pad(pad([t[1] for t in tables], 0.0), (0, 1))
-    visibility = pad([t[2] for t in tables], 1.0)
-    count = torch.tensor([t[3] for t in tables])
-    lengths = torch.tensor([[len(t[1]), len(t[2])] for t in tables])
-    exists = torch.arange(scores.shape[1]) < lengths[:, :1]
-    ranking = best_first(scores, exists, count)
-    valid = most_visible(visibility, torch.arange(visibility.shape[1]) < lengths[:, 1:], count)
+    counted = [best(scores, count) for _, scores, _, count in tables]
+    # One more row, so that there is padding even where no table has an estimate.
+    rows = 1 + max(map(len, counted))
     # Padding holds the best of all errors, which nothing may ever take.
-    errors = torch.full((len(tables), scores.shape[1], visibility.shape[1]), -1.0, dtype=torch.float64)
-    for row, table in zip(errors, tables, strict=True):
-        if table[1] and table[2]:
-            row[: len(table[1]), : len(table[2])] = torch.tensor(table[0], dtype=torch.float64)
-    ordered = errors.gather(1, ranking.order[:, :, None].expand_as(errors))
-    places = greedy_matches(ordered, thresholds, ranking.counted[:, :, None] & valid[:, None])
-    order = ranking.order[:, None].expand(-1, len(thresholds), -1)
-    estimates = torch.where(places < 0, -1, order.gather(2, places.clamp(min=0)))
-    counted = [o[c].tolist() for o, c in zip(ranking.order, ranking.counted, strict=True)]
-    return counted, [v[:g].tolist() for v, g in zip(valid, lengths[:, 1], strict=True)], estimates
+    errors = torch.full((len(tables), rows, max(len(t[2]) for t in tables)), -1.0, dtype=torch.float64)
+    usable = torch.zeros(errors.shape, dtype=torch.bool)
+    valid = []
+    for index, (table, _, visibility, count) in enumerate(tables):
+        chosen = best(visibility, count)
+        valid.append([i in chosen for i in range(len(visibility))])
+        for place, estimate in enumerate(counted[index]):
+            for annotation in range(len(visibility)):
+                errors[index, place, annotation] = table[estimate][annotation]
+                usable[index, place, annotation] = valid[-1][annotation]
+    places = greedy_matches(errors, thresholds, usable)
+    estimates = torch.full_like(places, -1)
+    for index, order in enumerate(counted):
+        for place, estimate in enumerate(order):
+            estimates[index][places[index] == place] = estimate
+    return counted, valid, estimates
 
 
 def test_equals_the_toolkit_on_its_tables(lmo_root):
@@ -119,25 +115,20 @@ def test_leading_dimensions_and_dtypes(rng):
     assert greedy_matches(errors[..., :0], thresholds).shape == (3, 10, 10, 0)
 
 
-def test_scores_that_are_no_numbers_come_last_and_padding_after_them():
-    values = torch.tensor([[math.nan, 0.1, 9.0, -math.inf, 0.3]])
-    exists = torch.tensor([[True, True, False, True, True]])
-    ranking = best_first(values, exists, torch.tensor([4]))
-    assert ranking.order.tolist() == [[4, 1, 0, 3, 2]]
-    assert ranking.counted.tolist() == [[True, True, True, True, False]]
+def test_scores_that_are_no_numbers_come_last():
+    values = [math.nan, 0.1, 9.0, 0.3, -math.inf]
+    assert best(values, None) == [2, 3, 1, 0, 4]
+    assert best(values, 2) == [2, 3]
+    assert best([], 3) == []
 
 
 def test_many_equal_scores_keep_their_order():
-    ranking = best_first(torch.zeros(2, 1000), torch.ones(2, 1000, dtype=torch.bool), torch.tensor([3, 999]))
-    assert torch.equal(ranking.order, torch.arange(1000).expand(2, -1))
-    assert ranking.counted.sum(1).tolist() == [3, 999]
+    assert best([0.0] * 1000, 999) == list(range(999))
     equal = greedy_matches(torch.full((300, 200), 0.1), torch.tensor([0.5]))
     assert torch.equal(equal[0], torch.arange(200))
 
 
 def test_wrong_shapes_are_named():
-    with pytest.raises(ValueError, match=r"values and exists must have shape \(N, n\).*\(2, 3\), \(2, 2\)"):
-        best_first(torch.zeros(2, 3), torch.ones(2, 2, dtype=torch.bool), torch.ones(2))
     with pytest.raises(ValueError, match=r"shape \(\.\.\., n, g\).*got torch.float32 \(3,\)"):
         greedy_matches(torch.zeros(3), torch.zeros(1))
     with pytest.raises(ValueError, match="must be floating"):

@@ -14,6 +14,7 @@ from foundpose.bop import (
     result_file_name,
     write_results,
 )
+from foundpose.geometry import se3_exp
 
 HEADER = "scene_id,im_id,obj_id,score,R,t,time"
 LINE = "1,2,3,0.5,1 0 0 0 1 0 0 0 1,10 20 30,0.1"
@@ -29,7 +30,8 @@ def same(a: PoseResult, b: PoseResult) -> bool:
 
 def random_result(generator, im_id=3, time=0.5, dtype=torch.float64) -> PoseResult:
     T = torch.eye(4, dtype=dtype)
-    T[:3] = torch.randn(3, 4, generator=generator, dtype=dtype) * 300
+    T[:3, :3] = se3_exp(torch.randn(6, generator=generator, dtype=torch.float64))[:3, :3]
+    T[:3, 3] = torch.randn(3, generator=generator, dtype=dtype) * 300
     score = float(torch.rand((), generator=generator, dtype=torch.float64))
     return PoseResult(2, im_id, 5, score, T, time)
 
@@ -118,6 +120,10 @@ def test_reads_what_others_write(tmp_path, text):
         (LINE.replace("1 0 0 0", "1 0 nan 0"), "R must be finite"),
         (LINE.replace("0.1", "-inf"), "time must be finite"),
         (LINE.replace("0.1", "-0.5"), "time must be at least 0, or -1"),
+        (LINE.replace("1 0 0 0 1 0 0 0 1", "-1 0 0 0 1 0 0 0 1"), "a reflection scaled by 1"),
+        (LINE.replace("1 0 0 0 1 0 0 0 1", "1e3 0 0 0 1e3 0 0 0 1e3"), "a rotation scaled by 1000"),
+        (LINE.replace("1 0 0 0 1 0 0 0 1", "1 0 0 0 1 0 0 0.5 1"), "axes are not orthogonal"),
+        (LINE.replace("1 0 0 0 1 0 0 0 1", "0 0 0 0 0 0 0 0 0"), "a rotation scaled by 0"),
         (LINE.replace("1,2", "1,2.5", 1), "invalid literal for int"),
     ],
 )

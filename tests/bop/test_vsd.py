@@ -1,13 +1,13 @@
 import json
 import math
 
-import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from foundpose.bop.vsd import distance_images, visible_surfaces, vsd
-from foundpose.bop.vsd_image import DepthObject, PosedObject, vsd_of_pairs
+from foundpose.bop.vsd_image import DepthImage, DepthObject, PosedObject, vsd_of_pairs
 from foundpose.geometry import se3_exp
 from foundpose.rendering import RaycastRenderer
 from foundpose.rendering.mesh_io import read_mesh_file
@@ -164,7 +164,7 @@ def test_pairs_in_windows_equal_whole_images(scene, monkeypatch):
     i, j = pairs.T
     expected = vsd(est[i], true[j], measured.round()[None], camera[None], TAUS, diameters)
     posed = [[PosedObject(objects[k], T) for k, T in items] for items in (estimates, truths)]
-    arguments = (*posed, pairs, measured.round().float(), camera, TAUS)
+    arguments = (*posed, pairs, DepthImage(measured.round().float(), camera), TAUS)
     got = vsd_of_pairs(*arguments)
     assert torch.allclose(got, expected, rtol=0, atol=1e-12)
     assert (got < 0.5).any()
@@ -181,10 +181,10 @@ def test_only_what_a_pair_needs_is_rendered(scene, monkeypatch):
         DepthObject, "render", lambda self, view: rendered.append(view) or original(self, view)
     )
     posed = [[PosedObject(objects[k], T) for k, T in items] for items in (estimates, truths)]
-    vsd_of_pairs(*posed, pairs, torch.zeros(240, 320), camera, TAUS)
+    vsd_of_pairs(*posed, pairs, DepthImage(torch.zeros(240, 320), camera), TAUS)
     assert len(rendered) == 3 + 4
     assert vsd_of_pairs(
-        [], [], torch.zeros(0, 2, dtype=torch.int64), torch.zeros(9, 9), camera, TAUS
+        [], [], torch.zeros(0, 2, dtype=torch.int64), DepthImage(torch.zeros(9, 9), camera), TAUS
     ).shape == (0, 10)
     assert len(rendered) == 7
 
@@ -196,7 +196,10 @@ def test_equals_the_toolkit_on_a_depth_image_of_lmo(lmo_root):
     reference = json.loads((folder / "vsd.json").read_text())
     info = json.loads((lmo_root / "models_eval" / "models_info.json").read_text())
     image, cases, truth = reference["image"], reference["cases"], reference["gt"]
-    depth = torch.from_numpy(iio.imread(folder / image["depth"]).astype(np.float32)) * image["depth_scale"]
+    depth = (
+        torch.from_numpy(np.asarray(Image.open(folder / image["depth"])).astype(np.float32))
+        * image["depth_scale"]
+    )
     camera = torch.tensor(image["cam_K"], dtype=torch.float64).reshape(3, 3)
     objects = {}
     for obj_id in {entry["obj_id"] for entry in truth}:
@@ -215,11 +218,15 @@ def test_equals_the_toolkit_on_a_depth_image_of_lmo(lmo_root):
     taus = reference["parameters"]["taus"]
     assert taus == TAUS
     assert len(cases) == 43
-    got = vsd_of_pairs(estimates, truths, pairs, depth, camera, taus, reference["parameters"]["delta_mm"])
+    got = vsd_of_pairs(
+        estimates, truths, pairs, DepthImage(depth, camera), taus, reference["parameters"]["delta_mm"]
+    )
     expected = torch.tensor([c["vsd"] for c in cases], dtype=torch.float64)
     union = torch.tensor([c["px"]["union"] for c in cases])[:, None]
     assert ((got - expected).abs() * union).max() <= 3
-    empty = vsd_of_pairs(estimates[:1], truths[:1], pairs[:1], torch.ones_like(depth), camera, taus)
+    empty = vsd_of_pairs(
+        estimates[:1], truths[:1], pairs[:1], DepthImage(torch.ones_like(depth), camera), taus
+    )
     assert empty[0].tolist() == reference["no_visible_pixel"]["vsd"]
 
     def distances(item):

@@ -1,0 +1,100 @@
+"""Masks of objects: reading them, and noticing those that are probably not what was meant."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy import ndimage
+from torch import Tensor
+
+from foundpose.utils.pictures import PictureError, check_size, read_picture
+from foundpose.utils.warn import warn_caller
+
+# Beyond this share of a picture a mask is rather the picture itself, or what is not the object.
+_NEARLY_ALL = 0.9
+# Pieces count as far apart if the box around all of them is so many times as large as that of the largest.
+_FAR = 2.0
+
+
+def read_mask(
+    path: str | Path,
+    size: tuple[int, int] | None = None,
+    may_be_empty: bool = False,
+) -> Tensor:
+    """Read a mask as (H, W) bool.
+
+    Of a picture whose alpha varies (a cut-out), alpha is the mask: True where more than half opaque. Of others, True
+    where any channel is above half of the range.
+
+    Args:
+        path: a picture.
+        size: expected (height, width).
+        may_be_empty: accept a mask without a bright pixel.
+
+    Raises:
+        FileNotFoundError: no such file.
+        PictureError: not a picture, one of another size, or (unless ``may_be_empty``) an empty mask.
+    """
+    picture = read_picture(path)
+    brightness = picture.rgb.amax(dim=0)
+    if picture.alpha is not None and bool((picture.alpha != picture.alpha[0, 0]).any()):
+        brightness = picture.alpha
+    mask = brightness > 0.5
+    if not may_be_empty and not bool(mask.any()):
+        raise PictureError(
+            f"the mask {path} is empty: no pixel is above half of the range (the brightest is "
+            f"{round(float(brightness.max()) * 255)} of 255; a mask of zeros and ones must be multiplied by 255)"
+        )
+    check_size(f"the mask {path}", mask, size)
+    return mask
+
+
+def largest_component(mask: Tensor) -> Tensor:
+    """The largest piece of a mask (H, W) bool; pixels that touch at a corner belong together."""
+    pieces, count = ndimage.label(mask.cpu().numpy(), structure=np.ones((3, 3)))
+    if count < 2:
+        return mask
+    largest = 1 + int(np.bincount(pieces.ravel())[1:].argmax())
+    return torch.from_numpy(pieces == largest).to(mask.device)
+
+
+def plausible_mask(mask: Tensor, name: str, keep_largest: bool = True) -> Tensor:
+    """A mask as it should be used for a crop, with a warning where it is hardly one object's.
+
+    Warned of are masks that cover more than nine tenths of the picture or all of its border (the share is named),
+    and masks whose pieces lie so far apart that the box around them has more than twice the area of the largest
+    piece's box: stray pixels, for one. Pieces that lie close together are an object that something hides in part, and
+    are left alone.
+
+    Args:
+        mask: (H, W) bool.
+        name: what to call it in a warning.
+        keep_largest: of pieces that are far apart, return the largest alone.
+
+    Returns:
+        (H, W) bool.
+    """
+    share = float(mask.float().mean())
+    border = torch.cat([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).float().mean()
+    if share > _NEARLY_ALL or (share > 0.5 and border > _NEARLY_ALL):
+        warn_caller(
+            f"{name} covers {share:.1%} of the picture, {float(border):.0%} of its border: is it inverted? "
+            "A mask is bright (or opaque) on the object"
+        )
+    largest = largest_component(mask)
+    if _box_area(mask) <= _FAR * _box_area(largest):
+        return mask
+    growth = _box_area(mask) / _box_area(largest)
+    left = (
+        "all are kept" if not keep_largest else "the others are left out (largest_component=false keeps them)"
+    )
+    warn_caller(
+        f"{name} has pieces far apart: the largest has {int(largest.sum())} of {int(mask.sum())} pixels, the box "
+        f"around all is {growth:.1f} times as large as its own; {left}"
+    )
+    return largest if keep_largest else mask
+
+
+def _box_area(mask: Tensor) -> int:
+    rows, columns = mask.any(dim=1).nonzero(), mask.any(dim=0).nonzero()
+    return int((rows.max() - rows.min() + 1) * (columns.max() - columns.min() + 1)) if len(rows) else 0
