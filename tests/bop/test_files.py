@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
-from omegaconf import OmegaConf
 from PIL import Image
 
 from foundpose.bop import PictureError, Target, read_depth, read_image, read_mask
@@ -113,7 +113,8 @@ def test_layouts_of_the_core_datasets(name, tmp_path, monkeypatch, rng):
         '[{"scene_id": 12, "im_id": 3, "obj_id": 5, "inst_count": 2}]'
     )
     monkeypatch.setenv("BOP_PATH", str(tmp_path))
-    dataset = instantiate(OmegaConf.load(CONF / "data" / f"{name}.yaml"))
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        dataset = instantiate(compose("evaluate", [f"data={name}"]).data)
     assert dataset.targets() == [Target(12, 3, 5, 2)]
     image = dataset.image(12, 3)
     assert image.shape == (3, 9, 16)
