@@ -12,7 +12,7 @@ from torch import Tensor
 
 from foundpose.geometry import make_transform
 from foundpose.optimization import BarronLoss
-from foundpose.refinement.featuremetric import AlignmentProblem, FeaturemetricAlignment
+from foundpose.refinement import AlignmentProblem, FeaturemetricAlignment
 
 Array = NDArray[Any]
 
@@ -69,7 +69,7 @@ def featuremetric_least_squares(
         raise ValueError(UNSUPPORTED)
     alpha, scale = float(loss.alpha), float(loss.scale)
     valid = problem.valid[0].cpu().numpy()
-    features = problem.features[0].double().cpu().numpy()
+    features = problem.maps.values[0].double().cpu().numpy()
     descriptors = problem.descriptors[0].double().cpu().numpy()[valid]
     points_model = problem.points_model[0].double().cpu().numpy()[valid]
     K = problem.K[0].double().cpu().numpy()
@@ -78,8 +78,8 @@ def featuremetric_least_squares(
     def residuals(parameters: Array) -> Array:
         y = camera(parameters) @ K.T
         pixels = y[:, :2] / y[:, 2:]
-        sampled = _bilinear(features, (pixels - problem.grid.offset) / problem.grid.stride)
-        outside = (pixels < -0.5) | (pixels > problem.image_size - 0.5)
+        sampled = _bilinear(features, (pixels - problem.maps.grid.offset) / problem.maps.grid.stride)
+        outside = (pixels < -0.5) | (pixels > problem.maps.image_size - 0.5)
         # A patch out of sight counts about the ceiling, as in ours.
         lost = outside.any(1) | (y[:, 2] <= 0)
         return np.where(lost[:, None], 1e3 * scale, sampled - descriptors).ravel()

@@ -1,7 +1,8 @@
 """Pose refinement: featuremetric alignment, the refiner contract, learned refiners."""
 
 from foundpose.refinement.base import Observation, PoseProposals, PoseRefiner
-from foundpose.refinement.featuremetric import Alignment, AlignmentProblem, FeaturemetricAlignment
+from foundpose.refinement.cost import AlignmentProblem, FeatureMaps
+from foundpose.refinement.featuremetric import Alignment, FeaturemetricAlignment
 from foundpose.refinement.interpolation import sample_features
 from foundpose.refinement.network import UpdateNetwork
 from foundpose.refinement.pose_update import apply_update, rotation_from_6d, rotation_to_6d, update_between
@@ -11,6 +12,7 @@ from foundpose.refinement.render_and_compare import PicturedObjects, RenderAndCo
 __all__ = [
     "Alignment",
     "AlignmentProblem",
+    "FeatureMaps",
     "FeaturemetricAlignment",
     "FeaturemetricRefiner",
     "Observation",

@@ -1,62 +1,25 @@
-"""Alignment of template descriptors with a feature map: the cost, its normal equations and its minimum."""
+"""Alignment of template descriptors with a feature map."""
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from foundpose.geometry import PatchGrid
-from foundpose.optimization import (
-    BarronLoss,
-    Differentiation,
-    Huber,
-    NormalEquations,
-    RobustLoss,
-    optimise_pose,
-)
+from foundpose.optimization import BarronLoss, Differentiation, Huber, RobustLoss, optimise_pose
 from foundpose.optimization.cholesky import scaled_cholesky
 from foundpose.optimization.implicit import check_differentiation
-from foundpose.pnp.polish import LocalFrame, project_in_frame
-from foundpose.refinement.interpolation import Interpolation, sample_features
+from foundpose.pnp.polish import LocalFrame
+from foundpose.refinement.cost import (
+    AlignmentProblem,
+    AutoScale,
+    FeaturemetricCost,
+    Linearisation,
+    ResidualKind,
+)
+from foundpose.refinement.interpolation import Interpolation
 
-ResidualKind = Literal["channel", "norm"]
-AutoScale = bool | Literal["object"]
-
-_OF_EACH_POSE = ("map_index", "K", "descriptors", "points_model", "valid")
 # Numbers of the descriptors of the poses that are aligned at once.
 _CPU_NUMBERS_PER_BLOCK = 1 << 20
-
-
-class AlignmentProblem(NamedTuple):
-    """What n poses are aligned with.
-
-    Attributes:
-        features: (m, h, w, d) projected feature maps of crops, channels last.
-        map_index: (n,) which map belongs to each pose, int64.
-        grid: where the map's cells lie in the crop.
-        image_size: side of the crops in pixels.
-        K: (n, 3, 3) intrinsics of the crops.
-        descriptors: (n, P, d) of the template's patches.
-        points_model: (n, P, 3) mesh units.
-        valid: (n, P) bool.
-        sizes: (n,) size of the residual that right matches of each pose's object leave, in the alignment's kind of
-            residual; for ``auto_scale="object"``.
-    """
-
-    features: Tensor
-    map_index: Tensor
-    grid: PatchGrid
-    image_size: int
-    K: Tensor
-    descriptors: Tensor
-    points_model: Tensor
-    valid: Tensor
-    sizes: Tensor | None = None
-
-    def take(self, rows: slice) -> "AlignmentProblem":
-        """The part of some of the poses."""
-        mine = {name: getattr(self, name)[rows] for name in _OF_EACH_POSE}
-        return self._replace(**mine, sizes=None if self.sizes is None else self.sizes[rows])
 
 
 class Alignment(NamedTuple):
@@ -193,51 +156,43 @@ class FeaturemetricAlignment(nn.Module):
         )
         if self.normalize:
             problem = problem._replace(
-                features=nn.functional.normalize(problem.features, dim=-1),
+                maps=problem.maps._replace(values=nn.functional.normalize(problem.maps.values, dim=-1)),
                 descriptors=nn.functional.normalize(problem.descriptors, dim=-1),
             )
+        points = problem.points_model
         if self.differentiation == "implicit":
             # The minimum depends neither on the start nor on the frame.
-            start = start.detach()
-            frame = LocalFrame.at(start, problem.points_model.detach(), valid.to(T.dtype))
-        else:
-            frame = LocalFrame.at(start, problem.points_model, valid.to(T.dtype))
-        goal = _Goal.of(problem, frame)
+            start, points = start.detach(), points.detach()
+        frame = LocalFrame.at(start, points, valid.to(T.dtype))
         start_local = frame.pose_to_local(start)
-        unit = self._unit(start_local, goal)
-        descriptors = problem.descriptors.detach()
-        ceiling = self._ceiling(descriptors if unit is None else descriptors * unit[:, None, None])
-
-        def evaluate(T_local: Tensor) -> NormalEquations:
-            return self._equations(T_local, goal, unit, ceiling)[0]
-
+        cost = FeaturemetricCost(
+            problem, frame, start_local, self.loss, self.residual, self.auto_scale, self.interpolation
+        )
         result = optimise_pose(
-            evaluate,
+            lambda T_local: cost(T_local).equations,
             start_local,
             differentiation=self.differentiation,
             max_iterations=self.max_iterations,
             tolerance=self.tolerance,
         )
         with torch.no_grad():
-            seen = self._equations(result.T, goal, unit, ceiling)
+            seen = cost(result.T)
         improved = ~result.failed & (result.cost < result.initial_cost)
         T_aligned = frame.pose_from_local(result.T)
         # A start that is the optimum already keeps its value to the bit, but has the optimum's gradient.
         T_kept = torch.where(result.failed[:, None, None], T, T.detach() + (T_aligned - T_aligned.detach()))
         T_final = torch.where(improved[:, None, None], T_aligned, T_kept)
-        count = valid.sum(-1).clamp(min=1)
-        most = ceiling.masked_fill(~valid, 0.0).sum(-1) / count
         # The equations have the half of the mean of ρ.
-        cost, initial = 2.0 * result.cost, 2.0 * result.initial_cost
+        least = 2.0 * result.cost
         return Alignment(
             T_crop_from_model=T_final,
-            cost=cost,
-            initial_cost=initial,
-            relative_cost=cost / most.clamp(min=torch.finfo(T.dtype).tiny),
+            cost=least,
+            initial_cost=2.0 * result.initial_cost,
+            relative_cost=least / cost.mean_ceiling().clamp(min=torch.finfo(T.dtype).tiny),
             iterations=result.iterations,
             converged=result.converged,
             failed=result.failed,
-            covariance=_covariance(result.H.detach(), seen[1], seen[2], count, frame),
+            covariance=_covariance(seen, cost.count, frame),
         )
 
     def residual_size(self) -> str:
@@ -245,72 +200,6 @@ class FeaturemetricAlignment(nn.Module):
         if self.residual == "norm":
             return "unit" if self.normalize else "match"
         return "channel"
-
-    def _loss_scale(self) -> Tensor | float:
-        """c of the loss."""
-        assert isinstance(self.loss, BarronLoss | Huber)
-        return self.loss.scale
-
-    def _unit(self, T_local: Tensor, goal: "_Goal") -> Tensor | None:
-        """Factors (n,) that bring residuals to the loss's unit; None without an automatic scale."""
-        if not self.auto_scale:
-            return None
-        if self.auto_scale == "object":
-            if goal.problem.sizes is None:
-                raise ValueError("auto_scale is 'object': give the problem's sizes, or set it to false")
-            return goal.problem.sizes.to(T_local.dtype).reciprocal()
-        with torch.no_grad():
-            rows, seen, _ = _residual_rows(T_local, goal, self.interpolation)
-            size = rows[:, :, 0].abs()
-            if self.residual == "norm":
-                size = torch.linalg.vector_norm(size, dim=-1, keepdim=True)
-            size = size.masked_fill(~seen.unsqueeze(-1), torch.nan).flatten(1)
-            spread = 1.4826 * size.nanmedian(dim=1).values
-            scale = torch.as_tensor(self._loss_scale(), dtype=spread.dtype, device=spread.device)
-            return torch.where(spread > 0, scale / spread, torch.ones_like(spread))
-
-    def _ceiling(self, descriptors: Tensor) -> Tensor:
-        """Cost (n, P) of a patch that is not seen."""
-        known = self.loss.fixed_alpha if isinstance(self.loss, BarronLoss) else 0.0
-        bound: Tensor | None = None
-        if isinstance(self.loss, BarronLoss) and (known is None or known < 0):
-            channels = descriptors.shape[-1] if self.residual == "channel" else 1
-            bound = (channels * self.loss.ceiling.to(descriptors.dtype)).expand(descriptors.shape[:2])
-            if known is not None:
-                return bound
-        # A loss without a ceiling: as if the crop showed the opposite of what the patch looks like.
-        squared = (2.0 * descriptors).square()
-        if self.residual == "norm":
-            squared = squared.sum(-1, keepdim=True)
-        opposite = self.loss(squared)[0].sum(-1)
-        # α is learned: which of the two it is, the device knows.
-        return opposite if bound is None else torch.where(torch.isfinite(bound), bound, opposite)
-
-    def _equations(
-        self, T_local: Tensor, goal: "_Goal", unit: Tensor | None, ceiling: Tensor
-    ) -> tuple[NormalEquations, Tensor, Tensor]:
-        """Normal equations of ½ mean ρ; weighted sum of squared residuals (n,) and sum of weights (n,)."""
-        rows, seen, J = _residual_rows(T_local, goal, self.interpolation)
-        if unit is not None:
-            rows = rows * unit[:, None, None, None]
-        squared = rows[:, :, 0].square()
-        if self.residual == "norm":
-            squared = squared.sum(-1, keepdim=True)
-        rho, weight = self.loss(squared)
-        valid = goal.problem.valid
-        count = valid.sum(-1).clamp(min=1).to(rho.dtype)
-        lost = valid & ~seen
-        cost = torch.where(seen, rho.sum(-1), torch.where(lost, ceiling, torch.zeros_like(ceiling)))
-        weight = weight * (seen / count.unsqueeze(-1)).unsqueeze(-1)
-        # All channels of a patch come down to the products of its three rows.
-        products = (rows * weight.unsqueeze(2)).flatten(0, 1) @ rows.flatten(0, 1).transpose(1, 2)
-        products = products.unflatten(0, valid.shape).permute(0, 2, 3, 1)  # (n, 3, 3, P)
-        gram, pull = products[:, 1:, 1:], products[:, 1:, 0]
-        weighted = (J * gram[:, None, 0]).sum(2), (J * gram[:, None, 1]).sum(2)
-        H = torch.stack(weighted, dim=2).flatten(2) @ J.flatten(2).transpose(1, 2)
-        g = (J.flatten(2) @ pull.flatten(1).unsqueeze(-1)).squeeze(-1)
-        energy = products[:, 0, 0].sum(-1).detach()
-        return NormalEquations(0.5 * cost.sum(-1) / count, H, g), energy, weight.sum((-1, -2)).detach()
 
     def extra_repr(self) -> str:
         """Settings, for printing."""
@@ -321,51 +210,12 @@ class FeaturemetricAlignment(nn.Module):
         )
 
 
-class _Goal(NamedTuple):
-    """What poses are aligned with, in the frame that they are optimised in.
-
-    Attributes:
-        problem: as given.
-        frame: the local frames.
-        points_local: (n, P, 3).
-        minus_descriptors: (n, P, 3, d): minus the descriptors, and two rows of zeros.
-    """
-
-    problem: AlignmentProblem
-    frame: LocalFrame
-    points_local: Tensor
-    minus_descriptors: Tensor
-
-    @classmethod
-    def of(cls, problem: AlignmentProblem, frame: LocalFrame) -> "_Goal":
-        """A problem in a frame."""
-        rows = nn.functional.pad(-problem.descriptors.unsqueeze(2), (0, 0, 0, 2))
-        return cls(problem, frame, frame.points(problem.points_model), rows)
-
-
-def _residual_rows(
-    T_local: Tensor, goal: _Goal, interpolation: Interpolation
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Residuals of patches and their slopes along columns and rows of the map (n, P, 3, d), which patches are seen
-    (n, P), and derivatives of the map's coordinates in the pose (n, 6, 2, P)."""
-    problem = goal.problem
-    pixels, depth, J = project_in_frame(T_local, goal.points_local, problem.K, goal.frame)
-    inside = ((pixels >= -0.5) & (pixels <= problem.image_size - 0.5)).all(1)
-    seen = problem.valid & (depth > 0) & inside
-    pixels = torch.where(seen.unsqueeze(1), pixels, torch.zeros_like(pixels))
-    position = problem.grid.to_map(pixels).transpose(1, 2)
-    rows = sample_features(
-        problem.features, problem.map_index, position, interpolation, goal.minus_descriptors
-    )
-    J = torch.where(seen[:, None, None], J, torch.zeros_like(J)) / problem.grid.stride
-    return rows, seen, J
-
-
-def _covariance(H: Tensor, energy: Tensor, weights: Tensor, count: Tensor, frame: LocalFrame) -> Tensor:
-    """Covariance (n, 6, 6) in the crop's frame from the equations of the mean."""
+def _covariance(seen: Linearisation, count: Tensor, frame: LocalFrame) -> Tensor:
+    """Covariance (n, 6, 6) in the crop's frame from the equations of the mean over so many patches."""
+    H = seen.equations.H
     system = scaled_cholesky(H, H.diagonal(dim1=-2, dim2=-1))
-    freedom = weights * count - 6.0
-    variance = energy / freedom.clamp(min=torch.finfo(H.dtype).eps)
+    freedom = seen.weights * count - 6.0
+    variance = seen.energy / freedom.clamp(min=torch.finfo(H.dtype).eps)
     to_crop = frame.twist_to_camera()
     covariance = variance[:, None, None] * (to_crop @ system.inverse() @ to_crop.transpose(-1, -2))
     unknown = torch.diag_embed(torch.full_like(H[:, 0], torch.inf))

@@ -8,7 +8,8 @@ from torch import Tensor, nn
 
 from foundpose.geometry import project_points, transform_points
 from foundpose.refinement.base import Observation, PoseProposals, PoseRefiner
-from foundpose.refinement.featuremetric import AlignmentProblem, FeaturemetricAlignment
+from foundpose.refinement.cost import AlignmentProblem, FeatureMaps
+from foundpose.refinement.featuremetric import FeaturemetricAlignment
 from foundpose.representation import ObjectGroups, ObjectRepresentation, TemplatePatches
 
 
@@ -125,10 +126,10 @@ def alignment_problem(
 
     patches = TemplatePatches(*(x.flatten(0, 1) for x in observation.groups.map(patches_of)))
     return AlignmentProblem(
-        features=observation.groups.map(project),
+        maps=FeatureMaps(
+            observation.groups.map(project), observation.grid, observation.crops.images.shape[-1]
+        ),
         map_index=torch.arange(B, device=T.device).repeat_interleave(n),
-        grid=observation.grid,
-        image_size=observation.crops.images.shape[-1],
         K=observation.crops.K_crop.to(T.dtype).repeat_interleave(n, dim=0),
         descriptors=patches.descriptors.to(T.dtype),
         points_model=patches.points_model.to(T.dtype),

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from foundpose.geometry import PatchGrid
 from foundpose.geometry.transforms import make_transform, se3_exp, transform_points
-from foundpose.refinement import AlignmentProblem, sample_features
+from foundpose.refinement import AlignmentProblem, FeatureMaps, sample_features
 
 SIZE, STRIDE, OFFSET = 140, 14.0, 6.5
 GRID = PatchGrid(STRIDE, OFFSET, 10)
@@ -54,14 +54,20 @@ def make_problem(
     p = sample_features(features, index, (pixels - OFFSET) / STRIDE, "bicubic")[..., 0, :]
     p = p + noise * torch.from_numpy(rng.normal(size=p.shape))
     valid = torch.ones(n, points, dtype=torch.bool)
-    problem = AlignmentProblem(features, index, GRID, SIZE, K, p, x, valid)
+    problem = AlignmentProblem(FeatureMaps(features, GRID, SIZE), index, K, p, x, valid)
     return cast(problem, dtype), T.to(dtype)
 
 
 def cast(problem: AlignmentProblem, dtype: torch.dtype) -> AlignmentProblem:
-    return AlignmentProblem(
-        *(x.to(dtype) if isinstance(x, Tensor) and x.is_floating_point() else x for x in problem)
-    )
+    moved = {
+        n: x.to(dtype) for n, x in problem._asdict().items() if n in ("K", "descriptors", "points_model")
+    }
+    return with_maps(problem, problem.maps.values.to(dtype))._replace(**moved)
+
+
+def with_maps(problem: AlignmentProblem, values: Tensor) -> AlignmentProblem:
+    """The same problem with other feature maps (m, h, w, d)."""
+    return problem._replace(maps=problem.maps._replace(values=values))
 
 
 def perturb(T: Tensor, degrees: float, distance: float, seed: int = 0) -> Tensor:

@@ -9,8 +9,8 @@ from foundpose.geometry.transforms import rotation_angle, se3_exp
 from foundpose.optimization import BarronLoss, Huber, LeastSquares
 from foundpose.pnp.polish import LocalFrame
 from foundpose.refinement import AlignmentProblem, FeaturemetricAlignment
-from foundpose.refinement.featuremetric import _Goal
-from tests.refinement.problems import OFFSET, SIZE, STRIDE, cast, make_problem, perturb
+from foundpose.refinement.cost import FeaturemetricCost
+from tests.refinement.problems import OFFSET, SIZE, STRIDE, cast, make_problem, perturb, with_maps
 
 SETTINGS = [
     {},
@@ -30,12 +30,11 @@ def build(**settings) -> FeaturemetricAlignment:
 def local_equations(module: FeaturemetricAlignment, T: Tensor, problem: AlignmentProblem):
     """The module's equations as a function of the local pose, and the local pose itself."""
     frame = LocalFrame.at(T, problem.points_model, problem.valid.double())
-    goal = _Goal.of(problem, frame)
-    ceiling = module._ceiling(problem.descriptors)
-    return (
-        lambda T_local: module._equations(T_local, goal, None, ceiling)[0],
-        frame.pose_to_local(T),
+    T_local = frame.pose_to_local(T)
+    cost = FeaturemetricCost(
+        problem, frame, T_local, module.loss, module.residual, interpolation=module.interpolation
     )
+    return lambda T: cost(T).equations, T_local
 
 
 @pytest.mark.parametrize("settings", SETTINGS[:2] + SETTINGS[3:5], ids=IDS[:2] + IDS[3:5])
@@ -79,7 +78,7 @@ def test_finds_the_pose(settings) -> None:
 def numpy_residuals(problem: AlignmentProblem, b: int, T: np.ndarray) -> np.ndarray:
     """F(π(R x + t)) − p by plain loops over bilinear cells, (P, d)."""
     x, p, K = (t[b].numpy() for t in (problem.points_model, problem.descriptors, problem.K))
-    F = problem.features[problem.map_index[b]].numpy()
+    F = problem.maps.values[problem.map_index[b]].numpy()
     camera = x @ T[:3, :3].T + T[:3, 3]
     u = camera @ K.T
     position = (u[:, :2] / u[:, 2:] - OFFSET) / STRIDE
@@ -153,16 +152,19 @@ def test_gradients_against_finite_differences(mode: str, settings) -> None:
     def value(problem: AlignmentProblem, start: Tensor = start) -> Tensor:
         return (pose_values(module(start, problem).T_crop_from_model) * probe).sum()
 
-    for name in ("features", "descriptors", "points_model", "K"):
-        x = getattr(problem, name)
+    def replaced(name: str, x: Tensor) -> AlignmentProblem:
+        return with_maps(problem, x) if name == "maps" else problem._replace(**{name: x})
+
+    for name in ("maps", "descriptors", "points_model", "K"):
+        x = problem.maps.values if name == "maps" else getattr(problem, name)
         leaf = x.clone().requires_grad_()
-        (gradient,) = torch.autograd.grad(value(problem._replace(**{name: leaf})), leaf)
+        (gradient,) = torch.autograd.grad(value(replaced(name, leaf)), leaf)
         assert gradient.abs().max() > 0
         direction = torch.randn(x.shape, generator=generator, dtype=torch.float64)
         if name == "K":
             direction = direction * torch.tensor([[1.0, 0, 1], [0, 1, 1], [0, 0, 0]], dtype=torch.float64)
         step = 1e-3
-        numeric = [value(problem._replace(**{name: x + s * direction})) for s in (step, -step)]
+        numeric = [value(replaced(name, x + s * direction)) for s in (step, -step)]
         expected = (numeric[0] - numeric[1]).item() / (2 * step)
         assert (gradient * direction).sum().item() == pytest.approx(expected, rel=1e-2, abs=1e-7), name
 
@@ -175,8 +177,8 @@ def test_implicit_and_unrolled_agree() -> None:
             differentiation=mode, interpolation="bicubic", max_iterations=100, tolerance=0.0,
             loss=BarronLoss(-5.0, 0.5, learnable=True),
         )  # fmt: skip
-        leaves = [x.clone().requires_grad_() for x in (problem.features, problem.descriptors)]
-        changed = problem._replace(features=leaves[0], descriptors=leaves[1])
+        leaves = [x.clone().requires_grad_() for x in (problem.maps.values, problem.descriptors)]
+        changed = with_maps(problem, leaves[0])._replace(descriptors=leaves[1])
         out = module(perturb(T, 1.0, 1.0), changed).T_crop_from_model
         gradients.append(
             torch.autograd.grad(pose_values(out).square()[:, :2].sum(), [*leaves, *module.parameters()])
@@ -274,8 +276,7 @@ def test_alone_as_in_a_batch_and_padded(settings) -> None:
     n = torch.zeros(1, dtype=torch.int64)
     for b in range(4):
         padding = (0, 0, 0, 7)
-        alone = problem._replace(
-            features=problem.features[b : b + 1],
+        alone = with_maps(problem, problem.maps.values[b : b + 1])._replace(
             map_index=n,
             K=problem.K[b : b + 1],
             descriptors=torch.nn.functional.pad(problem.descriptors[b : b + 1], padding, value=9.0),

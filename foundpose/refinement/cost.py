@@ -1,0 +1,190 @@
+"""The cost of featuremetric alignment, and its normal equations."""
+
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from foundpose.geometry import PatchGrid
+from foundpose.optimization import BarronLoss, Huber, NormalEquations, RobustLoss
+from foundpose.pnp.polish import LocalFrame, project_in_frame
+from foundpose.refinement.interpolation import Interpolation, sample_features
+
+ResidualKind = Literal["channel", "norm"]
+AutoScale = bool | Literal["object"]
+
+
+class FeatureMaps(NamedTuple):
+    """Feature maps of crops.
+
+    Attributes:
+        values: (m, h, w, d) projected descriptors, channels last.
+        grid: where the maps' cells lie in the crops.
+        image_size: side of the crops in pixels.
+    """
+
+    values: Tensor
+    grid: PatchGrid
+    image_size: int
+
+
+class AlignmentProblem(NamedTuple):
+    """What n poses are aligned with.
+
+    Attributes:
+        maps: feature maps of crops.
+        map_index: (n,) which map belongs to each pose, int64.
+        K: (n, 3, 3) intrinsics of the crops.
+        descriptors: (n, P, d) of the template's patches.
+        points_model: (n, P, 3) mesh units.
+        valid: (n, P) bool.
+        sizes: (n,) size of the residual that right matches of each pose's object leave, in the alignment's kind of
+            residual; for ``auto_scale="object"``.
+    """
+
+    maps: FeatureMaps
+    map_index: Tensor
+    K: Tensor
+    descriptors: Tensor
+    points_model: Tensor
+    valid: Tensor
+    sizes: Tensor | None = None
+
+    def take(self, rows: slice) -> "AlignmentProblem":
+        """The part of some of the poses."""
+        sizes = None if self.sizes is None else self.sizes[rows]
+        map_index, K, descriptors, points_model, valid = (x[rows] for x in self[1:6])
+        return AlignmentProblem(self.maps, map_index, K, descriptors, points_model, valid, sizes)
+
+
+class Linearisation(NamedTuple):
+    """The cost of n poses near where they are.
+
+    Attributes:
+        equations: normal equations of ½ mean ρ.
+        energy: (n,) weighted sum of the squared residuals; a constant for autograd.
+        weights: (n,) sum of the weights; a constant for autograd.
+    """
+
+    equations: NormalEquations
+    energy: Tensor
+    weights: Tensor
+
+
+class FeaturemetricCost:
+    """½ mean over the patches of ``ρ(F(π(R x_i + t)) − p_i)``, of n poses in their local frames.
+
+    Args:
+        problem: what the poses are aligned with.
+        frame: the local frames.
+        T_local: (n, 4, 4) initial poses, where an automatic scale is measured.
+        loss: ρ on squared residuals.
+        residual: "channel" or "norm".
+        auto_scale: see :class:`~foundpose.refinement.FeaturemetricAlignment`.
+        interpolation: of the feature maps.
+
+    Raises:
+        ValueError: the problem lacks the sizes that ``auto_scale="object"`` needs.
+    """
+
+    def __init__(
+        self,
+        problem: AlignmentProblem,
+        frame: LocalFrame,
+        T_local: Tensor,
+        loss: RobustLoss,
+        residual: ResidualKind = "channel",
+        auto_scale: AutoScale = False,
+        interpolation: Interpolation = "bilinear",
+    ) -> None:
+        self.problem = problem
+        self.frame = frame
+        self.loss = loss
+        self.residual = residual
+        self.interpolation = interpolation
+        self.points_local = frame.points(problem.points_model)
+        self.count = problem.valid.sum(-1).clamp(min=1)
+        # Minus the descriptors, and two rows of zeros: what is sampled is added to them.
+        self._offset = nn.functional.pad(-problem.descriptors.unsqueeze(2), (0, 0, 0, 2))
+        self._unit = self._measured_unit(T_local, auto_scale) if auto_scale else None
+        descriptors = problem.descriptors.detach()
+        self.ceiling = self._ceiling(
+            descriptors if self._unit is None else descriptors * self._unit[:, None, None]
+        )
+
+    def __call__(self, T_local: Tensor) -> Linearisation:
+        """Linearise the cost at poses (n, 4, 4) for ``T_local ← exp(δ) @ T_local``; differentiable."""
+        rows, seen, J = self._residual_rows(T_local)
+        if self._unit is not None:
+            rows = rows * self._unit[:, None, None, None]
+        squared = rows[:, :, 0].square()
+        if self.residual == "norm":
+            squared = squared.sum(-1, keepdim=True)
+        rho, weight = self.loss(squared)
+        valid, count = self.problem.valid, self.count.to(rho.dtype)
+        lost = valid & ~seen
+        cost = torch.where(seen, rho.sum(-1), self.ceiling.masked_fill(~lost, 0.0))
+        weight = weight * (seen / count.unsqueeze(-1)).unsqueeze(-1)
+        # All channels of a patch come down to the products of its three rows.
+        products = (rows * weight.unsqueeze(2)).flatten(0, 1) @ rows.flatten(0, 1).transpose(1, 2)
+        products = products.unflatten(0, valid.shape).permute(0, 2, 3, 1)  # (n, 3, 3, P)
+        gram, pull = products[:, 1:, 1:], products[:, 1:, 0]
+        weighted = (J * gram[:, None, 0]).sum(2), (J * gram[:, None, 1]).sum(2)
+        H = torch.stack(weighted, dim=2).flatten(2) @ J.flatten(2).transpose(1, 2)
+        g = (J.flatten(2) @ pull.flatten(1).unsqueeze(-1)).squeeze(-1)
+        return Linearisation(
+            NormalEquations(0.5 * cost.sum(-1) / count, H, g),
+            energy=products[:, 0, 0].sum(-1).detach(),
+            weights=weight.sum((-1, -2)).detach(),
+        )
+
+    def mean_ceiling(self) -> Tensor:
+        """Mean ρ (n,) if no patch were seen."""
+        return self.ceiling.masked_fill(~self.problem.valid, 0.0).sum(-1) / self.count
+
+    def _residual_rows(self, T_local: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Residuals of patches and their slopes along columns and rows of the map (n, P, 3, d), which patches are
+        seen (n, P), and derivatives of the map's coordinates in the pose (n, 6, 2, P)."""
+        maps, problem = self.problem.maps, self.problem
+        pixels, depth, J = project_in_frame(T_local, self.points_local, problem.K, self.frame)
+        inside = ((pixels >= -0.5) & (pixels <= maps.image_size - 0.5)).all(1)
+        seen = problem.valid & (depth > 0) & inside
+        pixels = torch.where(seen.unsqueeze(1), pixels, torch.zeros_like(pixels))
+        position = maps.grid.to_map(pixels).transpose(1, 2)
+        rows = sample_features(maps.values, problem.map_index, position, self.interpolation, self._offset)
+        J = torch.where(seen[:, None, None], J, torch.zeros_like(J)) / maps.grid.stride
+        return rows, seen, J
+
+    @torch.no_grad()
+    def _measured_unit(self, T_local: Tensor, auto_scale: AutoScale) -> Tensor:
+        """Factors (n,) that bring residuals to the loss's unit."""
+        if auto_scale == "object":
+            if self.problem.sizes is None:
+                raise ValueError("auto_scale is 'object': give the problem's sizes, or set it to false")
+            return self.problem.sizes.to(T_local.dtype).reciprocal()
+        assert isinstance(self.loss, BarronLoss | Huber)
+        rows, seen, _ = self._residual_rows(T_local)
+        size = rows[:, :, 0].abs()
+        if self.residual == "norm":
+            size = torch.linalg.vector_norm(size, dim=-1, keepdim=True)
+        size = size.masked_fill(~seen.unsqueeze(-1), torch.nan).flatten(1)
+        spread = 1.4826 * size.nanmedian(dim=1).values
+        scale = torch.as_tensor(self.loss.scale, dtype=spread.dtype, device=spread.device)
+        return torch.where(spread > 0, scale / spread, torch.ones_like(spread))
+
+    def _ceiling(self, descriptors: Tensor) -> Tensor:
+        """Cost (n, P) of a patch that is not seen."""
+        known = self.loss.fixed_alpha if isinstance(self.loss, BarronLoss) else 0.0
+        bound: Tensor | None = None
+        if isinstance(self.loss, BarronLoss) and (known is None or known < 0):
+            channels = descriptors.shape[-1] if self.residual == "channel" else 1
+            bound = (channels * self.loss.ceiling.to(descriptors.dtype)).expand(descriptors.shape[:2])
+            if known is not None:
+                return bound
+        # A loss without a ceiling: as if the crop showed the opposite of what the patch looks like.
+        squared = (2.0 * descriptors).square()
+        if self.residual == "norm":
+            squared = squared.sum(-1, keepdim=True)
+        opposite = self.loss(squared)[0].sum(-1)
+        # α is learned: which of the two it is, the device knows.
+        return opposite if bound is None else torch.where(torch.isfinite(bound), bound, opposite)
