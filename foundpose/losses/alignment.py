@@ -6,7 +6,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from foundpose.geometry.symmetries import Symmetries, axis_rotation
+from foundpose.geometry.symmetries import Symmetries, axis_rotation, nearest_axis_angles
 
 _GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
 _COARSE = 8
@@ -51,6 +51,36 @@ def best_symmetry(
     angle = torch.cat([torch.zeros_like(angles[..., :1]), angles], dim=-1).flatten(1)[sample, best]
     axis = (best % (1 + num_axes) - 1).clamp(min=0)
     return axis_rotation(symmetries.axes[sample, axis], symmetries.origins[sample, axis], angle) @ D
+
+
+def nearest_truth(
+    error: Callable[[Tensor], Tensor],
+    T_est: Tensor,
+    T_true: Tensor,
+    symmetries: Symmetries,
+    points: Tensor,
+    refine: bool = False,
+) -> Tensor:
+    """The equivalent true pose (B, 4, 4) of the smallest error; see :func:`best_symmetry`.
+
+    Args:
+        error: maps true poses (B, N, 4, 4) to errors (B, N), all constants.
+        T_est: (B, 4, 4) estimated poses.
+        T_true: (B, 4, 4) true poses.
+        symmetries: :class:`Symmetries` of B objects.
+        points: (B, M, 3) or (1, M, 3) of the models; angles are of least mean squared distance of these.
+        refine: whether that is only where to start.
+
+    Raises:
+        ValueError: the symmetries do not fit the poses.
+    """
+    symmetries.check(len(T_est), T_est)
+    a, b, x = T_est.detach(), T_true.detach(), points.detach()
+    mean = x.mean(dim=1)
+    centred = x - mean[:, None]
+    covariance = centred.mT @ centred / x.shape[1]
+    angles = nearest_axis_angles(a, b, symmetries.detach(), mean, covariance)
+    return T_true @ best_symmetry(lambda S: error(b[:, None] @ S), symmetries, angles, refine)
 
 
 def search_angles(error: Callable[[Tensor], Tensor], start: Tensor) -> Tensor:

@@ -1,12 +1,13 @@
 """Distance between the model's points under the estimated and the true pose."""
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from foundpose.geometry.symmetries import Symmetries, nearest_axis_angles
-from foundpose.losses.alignment import best_symmetry
+from foundpose.geometry.symmetries import Symmetries
+from foundpose.losses.alignment import nearest_truth
 from foundpose.losses.reduction import (
     Norm,
+    PoseLoss,
     Reduction,
     check_choice,
     check_like,
@@ -15,7 +16,6 @@ from foundpose.losses.reduction import (
     keep_valid,
     mean_norm,
     place_points,
-    reduce,
 )
 
 
@@ -70,24 +70,13 @@ def point_matching_error(
         check_like("diameter", diameter, T_est)
         diameter = keep_valid(valid, diameter, torch.ones_like(diameter))
     if symmetries is not None:
-        symmetries.check(len(T_est), T_est)
-        a, b, x = T_est.detach(), T_true.detach(), points.detach()
-        S = best_symmetry(
-            lambda S: _distance(a[:, None], b[:, None] @ S, x, norm),
-            symmetries,
-            nearest_angles_of_points(a, b, symmetries.detach(), x),
-            refine=norm != "squared",
+        a, x = T_est.detach()[:, None], points.detach()
+        nearest = nearest_truth(
+            lambda T: _distance(a, T, x, norm), T_est, T_true, symmetries, points, refine=norm != "squared"
         )
-        T_true = T_true @ keep_valid(valid, S, eye)
+        T_true = keep_valid(valid, nearest, eye)
     errors = _distance(T_est[:, None], T_true[:, None], points, norm, diameter).squeeze(1)
     return keep_valid(valid, errors, torch.zeros_like(errors))
-
-
-def nearest_angles_of_points(T_est: Tensor, T_true: Tensor, symmetries: Symmetries, points: Tensor) -> Tensor:
-    """Angles (B, S, A) of least mean squared distance of points (B, M, 3) or (1, M, 3)."""
-    mean = points.mean(dim=1)
-    centred = points - mean[:, None]
-    return nearest_axis_angles(T_est, T_true, symmetries, mean, centred.mT @ centred / points.shape[1])
 
 
 def _distance(T_a: Tensor, T_b: Tensor, points: Tensor, norm: Norm, unit: Tensor | None = None) -> Tensor:
@@ -99,7 +88,7 @@ def _distance(T_a: Tensor, T_b: Tensor, points: Tensor, norm: Norm, unit: Tensor
     return mean_norm(displacements, norm)
 
 
-class PointMatchingLoss(nn.Module):
+class PointMatchingLoss(PoseLoss):
     """Mean distance of model points between estimated and true pose; see :func:`point_matching_error`.
 
     Args:
@@ -108,11 +97,7 @@ class PointMatchingLoss(nn.Module):
     """
 
     def __init__(self, norm: Norm = "l1", reduction: Reduction = "none") -> None:
-        super().__init__()
-        check_choice("norm", norm, Norm)
-        check_choice("reduction", reduction, Reduction)
-        self.norm: Norm = norm
-        self.reduction: Reduction = reduction
+        super().__init__(reduction, norm)
 
     def forward(
         self,
@@ -128,8 +113,4 @@ class PointMatchingLoss(nn.Module):
         Differentiable w.r.t. the same.
         """
         errors = point_matching_error(T_est, T_true, points_model, symmetries, diameter, valid, self.norm)
-        return reduce(errors, valid, self.reduction)
-
-    def extra_repr(self) -> str:
-        """Settings, for printing."""
-        return f"norm={self.norm!r}, reduction={self.reduction!r}"
+        return self.reduce(errors, valid)

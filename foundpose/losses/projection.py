@@ -1,13 +1,13 @@
 """Distance between the projections of the model's points under the estimated and the true pose."""
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from foundpose.geometry.symmetries import Symmetries
-from foundpose.losses.alignment import best_symmetry
-from foundpose.losses.points import nearest_angles_of_points
+from foundpose.losses.alignment import nearest_truth
 from foundpose.losses.reduction import (
     Norm,
+    PoseLoss,
     Reduction,
     check_choice,
     check_like,
@@ -16,9 +16,10 @@ from foundpose.losses.reduction import (
     keep_valid,
     mean_norm,
     place_points,
-    reduce,
 )
 
+# Share of a point's true depth below which its projection is continued.
+_NEAR = 0.1
 # Cosine to the optical axis below which a true point counts as out of any view.
 _GRAZING = 0.01
 
@@ -31,11 +32,10 @@ def projection_error(
     symmetries: Symmetries | None = None,
     valid: Tensor | None = None,
     norm: Norm = "l1",
-    near: float = 0.1,
 ) -> Tensor:
     """Mean distance in pixels between projected model points, the least over the object's symmetries.
 
-    A point projects at ``K (x / z, y / z, 1)`` while its depth is above ``near`` times its true depth. Below that,
+    A point projects at ``K (x / z, y / z, 1)`` while its depth is above a tenth of its true depth. Below that,
     also behind the camera, 1 / z goes on along its tangent: an estimate whose points come too near or go behind
     the camera has a finite error that keeps growing with a slope that points back, where the true projection
     would jump to infinity and come back from the other side. True points more than 89° off the optical axis, or
@@ -52,19 +52,17 @@ def projection_error(
         symmetries: :class:`Symmetries` of the B objects; None for none.
         valid: (B,) bool; the error of a sample that is not valid is 0, with zero gradient, whatever it holds.
         norm: of a displacement: "l1" (sum of the absolute coordinates), "l2" or "squared" (l2, squared).
-        near: share of a point's true depth below which its projection is continued, in (0, 1).
 
     Returns:
         (B,) errors in pixels (squared for "squared").
 
     Raises:
-        ValueError: shapes, dtypes or devices disagree, or a setting is out of range.
+        ValueError: shapes, dtypes or devices disagree, or the norm is unknown.
 
     Differentiable w.r.t. ``T_est``, ``T_true``, ``points_model``, ``K`` and the symmetries' transforms, axes and
     origins, wherever the best symmetry is unique; its choice counts as a constant.
     """
     check_choice("norm", norm, Norm)
-    _check_near(near)
     check_poses(T_est, T_true, valid)
     points = check_points(points_model, T_est)
     if K.shape != (len(T_est), 3, 3):
@@ -75,31 +73,22 @@ def projection_error(
     points = keep_valid(valid, points, torch.ones_like(points[:1]))
     K = keep_valid(valid, K, eye[:3, :3])
     if symmetries is not None:
-        symmetries.check(len(T_est), T_est)
-        a, b, x, k = T_est.detach(), T_true.detach(), points.detach(), K.detach()
-        S = best_symmetry(
-            lambda S: _distance(a[:, None], b[:, None] @ S, x, k, norm, near),
-            symmetries,
-            nearest_angles_of_points(a, b, symmetries.detach(), x),
-            refine=True,
+        a, x, k = T_est.detach()[:, None], points.detach(), K.detach()
+        nearest = nearest_truth(
+            lambda T: _distance(a, T, x, k, norm), T_est, T_true, symmetries, points, refine=True
         )
-        T_true = T_true @ keep_valid(valid, S, eye)
-    errors = _distance(T_est[:, None], T_true[:, None], points, K, norm, near).squeeze(1)
+        T_true = keep_valid(valid, nearest, eye)
+    errors = _distance(T_est[:, None], T_true[:, None], points, K, norm).squeeze(1)
     return keep_valid(valid, errors, torch.zeros_like(errors))
 
 
-def _check_near(near: float) -> None:
-    if not 0.0 < near < 1.0:
-        raise ValueError(f"near must be in (0, 1), got {near}")
-
-
-def _distance(T_est: Tensor, T_true: Tensor, points: Tensor, K: Tensor, norm: Norm, near: float) -> Tensor:
+def _distance(T_est: Tensor, T_true: Tensor, points: Tensor, K: Tensor, norm: Norm) -> Tensor:
     """Errors (B, N) of poses (B, 1, 4, 4) against (B, N, 4, 4)."""
     estimated, true = place_points(T_est, points), place_points(T_true, points)
     x, y, z = true.unbind(-2)
     # Not vector_norm, which is slow here; the clamp keeps the derivative finite for a point in the camera itself.
     distance = (x * x + y * y + z * z).clamp(min=torch.finfo(z.dtype).tiny).sqrt()
-    nearest = torch.maximum(near * z, _GRAZING * distance).clamp(min=torch.finfo(z.dtype).eps)
+    nearest = torch.maximum(_NEAR * z, _GRAZING * distance).clamp(min=torch.finfo(z.dtype).eps)
     # The principal point cancels.
     displacements = K[:, None, :2, :2] @ (_slopes(estimated, nearest) - _slopes(true, nearest))
     return mean_norm(displacements, norm)
@@ -113,23 +102,16 @@ def _slopes(points: Tensor, nearest: Tensor) -> Tensor:
     return points[..., :2, :] * inverse.unsqueeze(-2)
 
 
-class ProjectionLoss(nn.Module):
+class ProjectionLoss(PoseLoss):
     """Mean distance in pixels between projected model points; see :func:`projection_error`.
 
     Args:
         norm: "l1", "l2" or "squared".
         reduction: "none" for (B,), "mean" over the valid samples or "sum".
-        near: share of a point's true depth below which its projection is continued, in (0, 1).
     """
 
-    def __init__(self, norm: Norm = "l1", reduction: Reduction = "none", near: float = 0.1) -> None:
-        super().__init__()
-        check_choice("norm", norm, Norm)
-        check_choice("reduction", reduction, Reduction)
-        _check_near(near)
-        self.norm: Norm = norm
-        self.reduction: Reduction = reduction
-        self.near = near
+    def __init__(self, norm: Norm = "l1", reduction: Reduction = "none") -> None:
+        super().__init__(reduction, norm)
 
     def forward(
         self,
@@ -144,9 +126,5 @@ class ProjectionLoss(nn.Module):
 
         Differentiable w.r.t. the same.
         """
-        errors = projection_error(T_est, T_true, points_model, K, symmetries, valid, self.norm, self.near)
-        return reduce(errors, valid, self.reduction)
-
-    def extra_repr(self) -> str:
-        """Settings, for printing."""
-        return f"norm={self.norm!r}, reduction={self.reduction!r}, near={self.near}"
+        errors = projection_error(T_est, T_true, points_model, K, symmetries, valid, self.norm)
+        return self.reduce(errors, valid)

@@ -3,7 +3,7 @@
 from typing import Literal, get_args
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 Norm = Literal["l1", "l2", "squared"]
 Reduction = Literal["none", "mean", "sum"]
@@ -86,10 +86,32 @@ def keep_valid(valid: Tensor | None, value: Tensor, neutral: Tensor) -> Tensor:
     return torch.where(valid.view(-1, *[1] * (value.dim() - 1)), value, neutral)
 
 
-def reduce(errors: Tensor, valid: Tensor | None, reduction: Reduction) -> Tensor:
-    """Reduce per-sample errors (B,); the mean is over the valid samples, and 0 where there is none."""
-    if reduction == "none":
-        return errors
-    if reduction == "sum":
-        return errors.sum()
-    return errors.sum() / (max(len(errors), 1) if valid is None else valid.sum().clamp(min=1))
+class PoseLoss(nn.Module):
+    """An error for each pose, reduced over the batch.
+
+    Args:
+        reduction: "none" for (B,), "mean" over the valid samples or "sum".
+        norm: of displacements, where there are any.
+
+    Raises:
+        ValueError: an unknown setting.
+    """
+
+    def __init__(self, reduction: Reduction, norm: Norm = "l1") -> None:
+        super().__init__()
+        check_choice("norm", norm, Norm)
+        check_choice("reduction", reduction, Reduction)
+        self.norm: Norm = norm
+        self.reduction: Reduction = reduction
+
+    def reduce(self, errors: Tensor, valid: Tensor | None) -> Tensor:
+        """Reduce errors (B,); the mean is over the valid samples, and 0 where there is none."""
+        if self.reduction == "none":
+            return errors
+        if self.reduction == "sum":
+            return errors.sum()
+        return errors.sum() / (max(len(errors), 1) if valid is None else valid.sum().clamp(min=1))
+
+    def extra_repr(self) -> str:
+        """Settings, for printing."""
+        return f"norm={self.norm!r}, reduction={self.reduction!r}"

@@ -1,12 +1,12 @@
 """Angle between the estimated and the true rotation."""
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from foundpose.geometry.symmetries import Symmetries, nearest_axis_angles
 from foundpose.geometry.transforms import make_transform, rotation_angle
 from foundpose.losses.alignment import best_symmetry
-from foundpose.losses.reduction import Reduction, check_choice, check_poses, keep_valid, reduce
+from foundpose.losses.reduction import PoseLoss, Reduction, check_poses, keep_valid
 
 
 def geodesic_rotation_error(
@@ -68,7 +68,7 @@ def _without_translation(R: Tensor) -> Tensor:
     return make_transform(R, torch.zeros_like(R[..., 0]))
 
 
-class GeodesicRotationLoss(nn.Module):
+class GeodesicRotationLoss(PoseLoss):
     """Angle in radians between estimated and true rotation; see :func:`geodesic_rotation_error`.
 
     Args:
@@ -76,9 +76,7 @@ class GeodesicRotationLoss(nn.Module):
     """
 
     def __init__(self, reduction: Reduction = "none") -> None:
-        super().__init__()
-        check_choice("reduction", reduction, Reduction)
-        self.reduction: Reduction = reduction
+        super().__init__(reduction)
 
     def forward(
         self, T_est: Tensor, T_true: Tensor, symmetries: Symmetries | None = None, valid: Tensor | None = None
@@ -87,7 +85,7 @@ class GeodesicRotationLoss(nn.Module):
 
         Differentiable w.r.t. the same.
         """
-        return reduce(geodesic_rotation_error(T_est, T_true, symmetries, valid), valid, self.reduction)
+        return self.reduce(geodesic_rotation_error(T_est, T_true, symmetries, valid), valid)
 
     def extra_repr(self) -> str:
         """Settings, for printing."""

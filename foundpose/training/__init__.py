@@ -4,13 +4,13 @@ Imports pytorch_lightning, as only ``foundpose.evaluation`` does besides.
 """
 
 from foundpose.training.adapter import AdapterTraining, PairLoss, PairPoses
-from foundpose.training.data import EpochShuffle, PairDataModule
+from foundpose.training.base import EpochShuffle, RenderedDataModule
+from foundpose.training.data import PairDataModule
 from foundpose.training.errors import PoseErrors, compare, summarize
 from foundpose.training.evaluation import evaluate_refiner, evaluate_scenes
 from foundpose.training.pairs import PairBatch, PairSettings, PatchPairs, make_pairs
 from foundpose.training.refiner import RefinerLoss, RefinerTraining, disentangled_error
 from foundpose.training.refiner_data import (
-    EndlessShuffle,
     Perturbation,
     PictureSettings,
     RefinerBatch,
@@ -27,7 +27,6 @@ from foundpose.training.views import (
 
 __all__ = [
     "AdapterTraining",
-    "EndlessShuffle",
     "EpochShuffle",
     "PairBatch",
     "PairDataModule",
@@ -43,6 +42,7 @@ __all__ = [
     "RefinerLoss",
     "RefinerPictures",
     "RefinerTraining",
+    "RenderedDataModule",
     "TemplateViews",
     "TrueCrops",
     "compare",

@@ -10,6 +10,7 @@ from foundpose.features import ResidualAdapter
 from foundpose.losses import GeodesicRotationLoss, PointMatchingLoss, ProjectionLoss
 from foundpose.matching import SoftPatchMatcher
 from foundpose.pnp import LevenbergMarquardtPnp, RansacPnp
+from foundpose.training.base import adam
 from foundpose.training.pairs import PairBatch
 
 
@@ -161,14 +162,4 @@ class AdapterTraining(pl.LightningModule):
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """Adam; decay for matrices only."""
-        groups: dict[bool, list[nn.Parameter]] = {True: [], False: []}
-        for parameter in self.parameters():
-            if parameter.requires_grad:
-                groups[parameter.dim() > 1].append(parameter)
-        return torch.optim.AdamW(
-            [
-                {"params": groups[True], "weight_decay": self.weight_decay},
-                {"params": groups[False], "weight_decay": 0.0},
-            ],
-            lr=self.learning_rate,
-        )
+        return adam(self, self.learning_rate, self.weight_decay)

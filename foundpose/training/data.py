@@ -1,46 +1,16 @@
 """Lightning's view of the pairs."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
-
-import pytorch_lightning as pl
-import torch
-from torch.utils.data import DataLoader, Sampler
 
 from foundpose.geometry import PerspectiveCrop, Symmetries
 from foundpose.onboarding import Onboarder, Progress
 from foundpose.rendering import Mesh
-from foundpose.synthetic import combine_seeds
-from foundpose.training.pairs import PairBatch, PairSettings, PatchPairs, make_pairs
+from foundpose.training.base import RenderedDataModule
+from foundpose.training.pairs import PairSettings, PatchPairs, make_pairs
 
 
-class EpochShuffle(Sampler[int]):
-    """A random order that depends on seed and epoch alone, so that a resumed training goes on as it would have.
-
-    Args:
-        count: number of items.
-        seed: of the order.
-    """
-
-    def __init__(self, count: int, seed: int) -> None:
-        self.count = count
-        self.seed = seed
-        self.epoch = 0
-
-    def set_epoch(self, epoch: int) -> None:
-        """Lightning calls this before every epoch."""
-        self.epoch = epoch
-
-    def __len__(self) -> int:
-        return self.count
-
-    def __iter__(self) -> Iterator[int]:
-        generator = torch.Generator().manual_seed(combine_seeds(self.seed, self.epoch))
-        return iter(torch.randperm(self.count, generator=generator).tolist())
-
-
-class PairDataModule(pl.LightningDataModule):
+class PairDataModule(RenderedDataModule):
     """Renders and describes pairs of crop and template once, at first need, and deals them out in batches.
 
     Args:
@@ -74,55 +44,24 @@ class PairDataModule(pl.LightningDataModule):
         symmetries: Symmetries | None = None,
         validation_symmetries: Symmetries | None = None,
     ) -> None:
-        super().__init__()
-        if not meshes:
-            raise ValueError("meshes is empty: give at least one to train on")
-        if batch_size < 1:
-            raise ValueError(f"batch_size must be at least 1, got {batch_size}")
-        self.meshes = list(meshes)
-        self.validation_meshes = list(validation_meshes)
+        super().__init__(meshes, validation_meshes, batch_size, 1, seed)
         self.onboarder = onboarder
         self.crop = crop
         self.pairs = pairs
-        self.batch_size = batch_size
-        self.seed = seed
         self.cache = None if cache is None else Path(cache)
         self.progress = progress
         self.symmetries = symmetries
         self.validation_symmetries = validation_symmetries
-        self.training: PatchPairs | None = None
-        self.validation: PatchPairs | None = None
 
-    def setup(self, stage: str | None = None) -> None:
+    def render(self, validation: bool) -> PatchPairs:
         """Make the pairs."""
-        if self.training is None:
-            self.training = self._make(self.meshes, self.seed, self.symmetries)
-        if self.validation is None and self.validation_meshes:
-            self.validation = self._make(self.validation_meshes, self.seed + 1, self.validation_symmetries)
-
-    def _make(self, meshes: Sequence[Mesh], seed: int, symmetries: Symmetries | None) -> PatchPairs:
         return make_pairs(
-            meshes, self.onboarder, self.crop, self.pairs, seed, self.cache, self.progress, symmetries
+            self.validation_meshes if validation else self.meshes,
+            self.onboarder,
+            self.crop,
+            self.pairs,
+            self.seed + validation,
+            self.cache,
+            self.progress,
+            self.validation_symmetries if validation else self.symmetries,
         )
-
-    def train_dataloader(self) -> DataLoader[PairBatch]:
-        """All training pairs in a new order each epoch.
-
-        Raises:
-            RuntimeError: :meth:`setup` has not been called; Lightning's trainer does.
-        """
-        if self.training is None:
-            raise RuntimeError("there are no pairs yet: call setup() before train_dataloader()")
-        sampler = EpochShuffle(len(self.training), self.seed)
-        return DataLoader(self.training, self.batch_size, sampler=sampler, collate_fn=_as_it_is)
-
-    def val_dataloader(self) -> list[DataLoader[PairBatch]]:
-        """All validation pairs, or nothing."""
-        if self.validation is None:
-            return []
-        return [DataLoader(self.validation, self.batch_size, collate_fn=_as_it_is)]
-
-
-def _as_it_is(batch: Any) -> Any:
-    """The data set makes batches itself."""
-    return batch

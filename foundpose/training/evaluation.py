@@ -9,8 +9,7 @@ from torch import Tensor, nn
 
 from foundpose.geometry import Symmetries, pose_deviation, rotation_angle
 from foundpose.losses import geodesic_rotation_error, point_matching_error
-from foundpose.losses.alignment import best_symmetry
-from foundpose.losses.points import nearest_angles_of_points
+from foundpose.losses.alignment import nearest_truth
 from foundpose.losses.reduction import mean_norm, place_points
 from foundpose.onboarding import Progress
 from foundpose.pipeline import FoundPose
@@ -115,7 +114,13 @@ def pose_errors(
     T_nearest = T_true
     if symmetries is not None:
         symmetries = symmetries.to("cpu", T_est.dtype).gather(torch.zeros(len(T_est), dtype=torch.int64))
-        T_nearest = _nearest_truth(T_est, T_true, symmetries, points[None])
+        T_nearest = nearest_truth(
+            lambda T: mean_norm(place_points(T_est[:, None] - T, points[None]), "squared"),
+            T_est,
+            T_true,
+            symmetries,
+            points[None],
+        )
     _, lateral, depth = pose_deviation(T_est, T_nearest, diameter)
     rotation = torch.rad2deg(geodesic_rotation_error(T_est, T_true, symmetries))
     matching = point_matching_error(T_est, T_true, points, symmetries, norm="l2") / diameter
@@ -126,16 +131,6 @@ def pose_errors(
         torch.where(valid, matching, torch.inf).clamp(max=1.0),
         valid,
     )
-
-
-def _nearest_truth(T_est: Tensor, T_true: Tensor, symmetries: Symmetries, points: Tensor) -> Tensor:
-    """The equivalent true poses that bring points (1, M, 3) nearest to the estimates, by mean squared distance."""
-    angles = nearest_angles_of_points(T_est, T_true, symmetries, points)
-
-    def error(S: Tensor) -> Tensor:
-        return mean_norm(place_points(T_est[:, None] - T_true[:, None] @ S, points), "squared")
-
-    return T_true @ best_symmetry(error, symmetries, angles, refine=False)
 
 
 @torch.no_grad()  # a measurement

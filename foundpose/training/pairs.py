@@ -116,7 +116,7 @@ class PatchPairs(torch.utils.data.Dataset[PairBatch]):
     def __getitems__(self, indices: Sequence[int]) -> PairBatch:
         """A batch of pairs."""
         t = self.tensors
-        pair = torch.as_tensor(indices)
+        pair = torch.as_tensor(indices) % len(self)
         query, mesh = t["query_of"][pair], t["mesh_of"][pair]
         query_rows, query_valid = _rows(t["query_offsets"], query)
         template_rows, template_valid = _rows(t["template_offsets"], pair)

@@ -5,10 +5,11 @@ from typing import NamedTuple
 
 import pytorch_lightning as pl
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from foundpose.losses import point_matching_error
 from foundpose.refinement import RenderAndCompareRefiner, Views, apply_update, update_between
+from foundpose.training.base import adam
 from foundpose.training.refiner_data import RefinerBatch
 
 
@@ -137,17 +138,7 @@ class RefinerTraining(pl.LightningModule):
 
     def configure_optimizers(self) -> pl.utilities.types.OptimizerLRScheduler:
         """AdamW, decay for matrices only; the learning rate follows a cosine over the trainer's epochs."""
-        groups: dict[bool, list[nn.Parameter]] = {True: [], False: []}
-        for parameter in self.parameters():
-            if parameter.requires_grad:
-                groups[parameter.dim() > 1].append(parameter)
-        optimizer = torch.optim.AdamW(
-            [
-                {"params": groups[True], "weight_decay": self.weight_decay},
-                {"params": groups[False], "weight_decay": 0.0},
-            ],
-            lr=self.learning_rate,
-        )
+        optimizer = adam(self, self.learning_rate, self.weight_decay)
         # Lightning's guess of the number of steps; of the epochs set now, so a resumed run may have more.
         steps = max(1, int(self.trainer.estimated_stepping_batches))
 

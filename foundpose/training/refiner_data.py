@@ -1,21 +1,21 @@
 """Pictures of objects with perturbed poses: what a learned refiner is trained and measured on."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import pytorch_lightning as pl
 import torch
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset, Sampler
+from torch.utils.data import Dataset
 
-from foundpose.geometry import PerspectiveCrop, make_transform
+from foundpose.geometry import PerspectiveCrop, make_transform, transform_points
 from foundpose.onboarding import Progress
 from foundpose.refinement import PicturedObjects
 from foundpose.rendering import Mesh, Renderer
 from foundpose.synthetic import LightVariation, combine_seeds
+from foundpose.training.base import RenderedDataModule
 from foundpose.training.views import render_crops
 
 _CHUNK = 16  # scenes that are drawn at a time
@@ -51,7 +51,7 @@ class Perturbation:
         draws = draws.to(T_camera_from_model)
         turn = axis_angle_to_rotation_matrix(math.radians(self.rotation) * draws[:, :3])
         R = turn @ T_camera_from_model[:, :3, :3]
-        x, y, z = _transform(T_camera_from_model, centre).unbind(-1)
+        x, y, z = transform_points(T_camera_from_model, centre.unsqueeze(1)).squeeze(1).unbind(-1)
         depth = z * torch.exp(self.depth * draws[:, 5])
         moved = torch.stack([x / z + self.lateral * draws[:, 3], y / z + self.lateral * draws[:, 4]], -1)
         moved = torch.cat([moved * depth[:, None], depth[:, None]], dim=-1)
@@ -142,7 +142,7 @@ class RefinerPictures(Dataset[RefinerBatch]):
             for start in range(0, count, _CHUNK):
                 seeds = [combine_seeds(seed, number, k) for k in range(start, min(start + _CHUNK, count))]
                 found = render_crops(
-                    mesh, seeds, crop, renderer, settings.light, settings.occlusion, *settings.scene
+                    mesh, seeds, crop, renderer, settings.light, settings.occlusion, settings.scene
                 )
                 pictures.append((found.crops.images * 255.0).round().to(torch.uint8))
                 cameras.append(found.crops.K_crop)
@@ -185,36 +185,7 @@ class RefinerPictures(Dataset[RefinerBatch]):
         )
 
 
-class EndlessShuffle(Sampler[int]):
-    """Each epoch all pictures in a new order with new perturbations; a resumed training goes on as it would have.
-
-    Args:
-        count: number of pictures.
-        seed: of the order.
-        passes: how often each picture is shown in an epoch.
-    """
-
-    def __init__(self, count: int, seed: int, passes: int = 1) -> None:
-        self.count = count
-        self.seed = seed
-        self.passes = passes
-        self.epoch = 0
-
-    def set_epoch(self, epoch: int) -> None:
-        """Lightning calls this before every epoch."""
-        self.epoch = epoch
-
-    def __len__(self) -> int:
-        return self.count * self.passes
-
-    def __iter__(self) -> Iterator[int]:
-        for number in range(self.epoch * self.passes, (self.epoch + 1) * self.passes):
-            generator = torch.Generator().manual_seed(combine_seeds(self.seed, number))
-            order = torch.randperm(self.count, generator=generator)
-            yield from (order + number * self.count).tolist()
-
-
-class RefinerDataModule(pl.LightningDataModule):
+class RefinerDataModule(RenderedDataModule):
     """Renders the pictures once, at first need, and deals them out in batches with ever new perturbations.
 
     Args:
@@ -246,58 +217,26 @@ class RefinerDataModule(pl.LightningDataModule):
         surface_points: int = 256,
         progress: Progress | None = None,
     ) -> None:
-        super().__init__()
-        if not meshes:
-            raise ValueError("meshes is empty: give at least one to train on")
-        if batch_size < 1 or passes < 1:
-            raise ValueError(f"batch_size and passes must be at least 1, got {batch_size} and {passes}")
-        self.meshes = list(meshes)
-        self.validation_meshes = list(validation_meshes)
+        super().__init__(meshes, validation_meshes, batch_size, passes, seed)
         self.renderer = renderer
         self.pictures = pictures
         self.perturbation = perturbation
-        self.batch_size = batch_size
-        self.passes = passes
-        self.seed = seed
         self.surface_points = surface_points
         self.progress = progress
-        self.training: RefinerPictures | None = None
-        self.validation: RefinerPictures | None = None
 
-    def setup(self, stage: str | None = None) -> None:
+    def render(self, validation: bool) -> RefinerPictures:
         """Render the pictures."""
-        if self.training is None:
-            self.training = self._make(self.meshes, self.seed)
-        if self.validation is None and self.validation_meshes:
-            self.validation = self._make(self.validation_meshes, combine_seeds(self.seed, 1))
-
-    def _make(self, meshes: Sequence[Mesh], seed: int) -> RefinerPictures:
         return RefinerPictures(
-            meshes, self.pictures, self.perturbation, self.renderer, seed, self.surface_points, self.progress
+            self.validation_meshes if validation else self.meshes,
+            self.pictures,
+            self.perturbation,
+            self.renderer,
+            combine_seeds(self.seed, 1) if validation else self.seed,
+            self.surface_points,
+            self.progress,
         )
-
-    def train_dataloader(self) -> DataLoader[RefinerBatch]:
-        """All pictures in a new order, with new perturbations, each epoch."""
-        assert self.training is not None, "call setup first"
-        sampler = EndlessShuffle(len(self.training), self.seed, self.passes)
-        return DataLoader(self.training, self.batch_size, sampler=sampler, collate_fn=_as_it_is)
-
-    def val_dataloader(self) -> list[DataLoader[RefinerBatch]]:
-        """All validation pictures with one perturbation each, or nothing."""
-        if self.validation is None:
-            return []
-        return [DataLoader(self.validation, self.batch_size, collate_fn=_as_it_is)]
-
-
-def _transform(T: Tensor, points: Tensor) -> Tensor:
-    return (T[:, :3, :3] @ points.unsqueeze(-1)).squeeze(-1) + T[:, :3, 3]
 
 
 def _spread(vertices: Tensor, count: int) -> Tensor:
     """``count`` of the vertices at even steps; small meshes repeat theirs."""
     return vertices[torch.linspace(0, len(vertices) - 1, count).round().long()]
-
-
-def _as_it_is(batch: Any) -> Any:
-    """The data set makes batches itself."""
-    return batch

@@ -10,7 +10,7 @@ from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor
 
 from foundpose.geometry import Crops, PerspectiveCrop
-from foundpose.onboarding import Onboarder, TemplateCameras, register_patches, template_cameras
+from foundpose.onboarding import Onboarder, register_patches, template_cameras
 from foundpose.onboarding.templates import RegisteredPatches
 from foundpose.rendering import Mesh, Renderer
 from foundpose.synthetic import LightVariation, cluttered_scene
@@ -33,12 +33,10 @@ class TemplateViews(NamedTuple):
 
     Attributes:
         rgb: (B, 3, S, S) in [0, 1].
-        cameras: their cameras.
         patches: the points that their patches show.
     """
 
     rgb: Tensor
-    cameras: TemplateCameras
     patches: RegisteredPatches
 
 
@@ -49,8 +47,7 @@ def render_crops(
     renderer: Renderer,
     light: LightVariation | None = None,
     occlusion: bool = True,
-    height: int = 480,
-    width: int = 640,
+    size: tuple[int, int] = (480, 640),
 ) -> TrueCrops:
     """Crop an object out of cluttered scenes.
 
@@ -61,15 +58,14 @@ def render_crops(
         renderer: draws the object.
         light: how the light varies between scenes.
         occlusion: hide a corner of the object in each scene.
-        height: of a scene in pixels.
-        width: of a scene in pixels.
+        size: height and width of a scene in pixels.
 
     Raises:
         ValueError: there are no seeds.
     """
     if len(seeds) == 0:
         raise ValueError("there is nothing to render: seeds is empty")
-    scenes = [cluttered_scene(mesh, seed, height, width, occlusion, renderer, light) for seed in seeds]
+    scenes = [cluttered_scene(mesh, seed, *size, occlusion, renderer, light) for seed in seeds]
     image, K, mask, T_camera_from_model = (torch.stack(parts) for parts in zip(*scenes, strict=True))
     crops = crop(image, K, mask)
     return TrueCrops(crops, crops.T_crop_from_camera @ T_camera_from_model)
@@ -104,4 +100,4 @@ def render_templates(mesh: Mesh, rotations: Tensor, onboarder: Onboarder) -> Tem
         extractor.patch_grid(size),
         onboarder.mask_erosion,
     )
-    return TemplateViews(render.rgb, cameras, patches)
+    return TemplateViews(render.rgb, patches)

@@ -447,5 +447,3 @@ def test_bad_input_is_refused():
         PointMatchingLoss(norm="l3")
     with pytest.raises(ValueError, match="reduction must be one of none, mean, sum"):
         GeodesicRotationLoss(reduction="max")
-    with pytest.raises(ValueError, match=r"near must be in \(0, 1\), got 1.0"):
-        ProjectionLoss(near=1.0)

@@ -17,7 +17,7 @@ from foundpose.refinement import RenderAndCompareRefiner, UpdateNetwork, apply_u
 from foundpose.rendering import RaycastRenderer
 from foundpose.synthetic import LightVariation
 from foundpose.training import (
-    EndlessShuffle,
+    EpochShuffle,
     Perturbation,
     PictureSettings,
     PoseErrors,
@@ -112,14 +112,14 @@ def test_pictures_show_the_objects_at_the_true_poses(pictures, bodies):
 
 
 def test_order_depends_on_seed_and_epoch():
-    sampler = EndlessShuffle(10, 0, passes=2)
+    sampler = EpochShuffle(10, 0, passes=2)
     first = list(sampler)
     assert len(first) == len(sampler) == 20
     assert sorted(first) == list(range(20))
     sampler.set_epoch(1)
     assert sorted(sampler) == list(range(20, 40))
     assert [k % 10 for k in sampler] != [k % 10 for k in first]
-    assert list(EndlessShuffle(10, 0, passes=2)) == first != list(EndlessShuffle(10, 1, passes=2))
+    assert list(EpochShuffle(10, 0, passes=2)) == first != list(EpochShuffle(10, 1, passes=2))
 
 
 def test_disentangled_error_by_hand(pictures):
