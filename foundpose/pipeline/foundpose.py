@@ -9,15 +9,10 @@ from torch import Tensor, nn
 from foundpose.features.base import Fingerprint, PatchExtractor
 from foundpose.geometry import Crops, PerspectiveCrop
 from foundpose.pipeline.hypotheses import HypothesisMaker
-from foundpose.pipeline.query import project_query, select_query_patches
+from foundpose.pipeline.query import describe_query
+from foundpose.pipeline.refining import RefineWhat, refine_estimates
 from foundpose.pipeline.results import PoseEstimates
-from foundpose.pipeline.selection import (
-    RefineWhat,
-    choose_coarse,
-    choose_refined,
-    hypotheses_to_refine,
-    propose,
-)
+from foundpose.pipeline.selection import choose_coarse
 from foundpose.refinement import Observation, PoseRefiner
 from foundpose.rendering import Mesh
 from foundpose.representation import ObjectGroups, ObjectRepresentation, RepresentationInfo, take_rows
@@ -134,7 +129,7 @@ class FoundPose(nn.Module):
                 crops,
                 features,
                 self.extractor.patch_grid(self.crop.size),
-                project_query(select_query_patches(features, crops, self.extractor), groups),
+                describe_query(features, crops, self.extractor, groups),
                 groups,
                 images,
                 K,
@@ -147,14 +142,7 @@ class FoundPose(nn.Module):
             estimates = choose_coarse(observation, templates, found)
             if self.refiner is None:
                 return estimates
-            chosen = hypotheses_to_refine(estimates, self.refine)
-            proposals = propose(estimates, chosen)
-            refined = self.refiner(proposals, observation)
-            num_inliers = estimates.hypotheses.num_inliers.gather(1, chosen)
-            score = self.hypotheses.score_refined(refined.T_crop_from_model, num_inliers, observation)
-            if score is not None:
-                refined = refined._replace(score=score)
-            return choose_refined(estimates, proposals, refined, chosen)
+            return refine_estimates(estimates, observation, self.hypotheses, self.refiner, self.refine)
 
     def _check_objects(self, objects: list[ObjectRepresentation]) -> None:
         if not objects:

@@ -39,11 +39,14 @@ def select_query_patches(features: PatchFeatures, crops: Crops, extractor: Patch
     return QueryPatches(descriptors, pixels.reshape(-1, 2)[order], valid.gather(1, order), features.cls)
 
 
-def project_query(raw: QueryPatches, groups: ObjectGroups) -> QueryPatches:
-    """The same patches with the descriptors of each crop's object: projected by its PCA.
+def describe_query(
+    features: PatchFeatures, crops: Crops, extractor: PatchExtractor, groups: ObjectGroups
+) -> QueryPatches:
+    """The patches of :func:`select_query_patches` as each crop's object describes them: projected by its PCA.
 
-    Differentiable w.r.t. the descriptors.
+    Differentiable w.r.t. the features.
     """
+    raw = select_query_patches(features, crops, extractor)
 
     def project(obj: ObjectRepresentation, rows: Tensor) -> QueryPatches:
         part = take_rows(raw, rows)

@@ -1,16 +1,12 @@
 """Which of several poses of a crop to keep."""
 
-from typing import Literal
-
 import torch
 from torch import Tensor
 
 from foundpose.geometry import invert_transform
 from foundpose.pipeline.results import Hypothesised, PoseEstimates, PoseHypotheses, PoseStatus
-from foundpose.refinement import Observation, PoseProposals
+from foundpose.refinement import Observation
 from foundpose.retrieval import RetrievedTemplates
-
-RefineWhat = Literal["best", "all"]
 
 
 def choose_coarse(
@@ -19,7 +15,7 @@ def choose_coarse(
     """Keep the hypothesis with the best score; of equal ones, that of the more similar template."""
     crops, query, hypotheses = observation.crops, observation.query, found.hypotheses
     solved = hypotheses.status == PoseStatus.OK
-    best = _first_of_best(hypotheses.score.detach().masked_fill(~solved, -torch.inf)).squeeze(1)
+    best = first_of_best(hypotheses.score.detach().masked_fill(~solved, -torch.inf)).squeeze(1)
     row = torch.arange(len(best), device=best.device)
     status = hypotheses.status[row, best]
     status = torch.where(query.valid.any(dim=1), status, torch.full_like(status, PoseStatus.NO_PATCHES))
@@ -44,53 +40,7 @@ def choose_coarse(
     )
 
 
-def hypotheses_to_refine(estimates: PoseEstimates, refine: RefineWhat) -> Tensor:
-    """Indices (B, n) of the hypotheses to refine: the chosen one, or all."""
-    B, h = estimates.hypotheses.num_inliers.shape
-    if refine == "best":
-        return estimates.best[:, None]
-    return torch.arange(h, device=estimates.best.device).expand(B, h)
-
-
-def propose(estimates: PoseEstimates, chosen: Tensor) -> PoseProposals:
-    """Some (B, n) of the hypotheses, to be refined."""
-    hypotheses, crops = estimates.hypotheses, estimates.crops
-    return PoseProposals(
-        T_crop_from_model=torch.take_along_dim(hypotheses.T_crop_from_model, chosen[..., None, None], dim=1),
-        score=hypotheses.score.gather(1, chosen).to(crops.K_crop.dtype),
-        valid=(hypotheses.status.gather(1, chosen) == PoseStatus.OK) & crops.valid[:, None],
-        template_index=estimates.templates.index.gather(1, chosen),
-    )
-
-
-def choose_refined(
-    estimates: PoseEstimates, proposals: PoseProposals, refined: PoseProposals, rank: Tensor
-) -> PoseEstimates:
-    """Keep the refined pose with the best score; a crop of which none could be refined keeps its coarse pose."""
-    score = torch.where(refined.valid, refined.score.detach(), -torch.inf)
-    chosen = _first_of_best(score)
-    found = refined.valid.any(dim=1) & estimates.valid
-
-    def take(x: Tensor) -> Tensor:
-        index = chosen.reshape(-1, 1, *[1] * (x.dim() - 2))
-        return torch.take_along_dim(x, index, dim=1).squeeze(1)
-
-    T_camera_from_crop = invert_transform(estimates.crops.T_crop_from_camera)
-    coarse = T_camera_from_crop @ take(proposals.T_crop_from_model)
-    T = T_camera_from_crop @ take(refined.T_crop_from_model)
-    best = torch.where(found, take(rank), estimates.best)
-    num_inliers = estimates.hypotheses.num_inliers.gather(1, best[:, None]).squeeze(1)
-    return estimates._replace(
-        T_camera_from_model=torch.where(found[:, None, None], T, estimates.T_camera_from_model),
-        T_coarse=torch.where(found[:, None, None], coarse, estimates.T_coarse),
-        score=torch.where(found, take(refined.score), torch.zeros_like(estimates.score)),
-        num_inliers=torch.where(found, num_inliers, estimates.num_inliers),
-        best=best,
-        refined=refined,
-    )
-
-
-def _first_of_best(score: Tensor) -> Tensor:
+def first_of_best(score: Tensor) -> Tensor:
     """Places (B, 1) of the largest scores (B, n); of equal ones the first."""
     top = score.amax(dim=1, keepdim=True)
     place = torch.arange(score.shape[1], device=score.device).expand_as(score)

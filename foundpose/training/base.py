@@ -14,7 +14,7 @@ from foundpose.synthetic import combine_seeds
 
 
 class EpochShuffle(Sampler[int]):
-    """Each epoch all items in an order that depends on seed and epoch alone, so that a resumed training goes on as before.
+    """Each epoch all items in an order that depends on seed and epoch alone: a resumed training goes on as it would.
 
     Item ``k`` is item ``k % count`` for the ``k // count``-th time, for data that draw something anew each time.
 
