@@ -37,6 +37,7 @@ from foundpose.evaluation.records import (
     pose_records,
     to_results,
 )
+from foundpose.evaluation.report import in_words, unanswered
 from foundpose.geometry import boxes_from_xywh, intrinsics_matrix, masks_from_boxes
 from foundpose.pipeline.results import PoseEstimates
 from foundpose.rendering import Mesh, Renderer, load_mesh
@@ -177,9 +178,12 @@ def estimate_dataset(cfg: DictConfig, output: Path) -> None:
     add_image_times(entries)
     write_json(output / "estimates.json", entries)
     csv = output / result_file_name(cfg.method, dataset.name, cfg.data.split)
-    write_results(csv, best_results(to_results(entries), dataset.targets()))
+    results = best_results(to_results(entries), dataset.targets())
+    write_results(csv, results)
     valid = sum(entry["valid"] for entry in entries)
     print(f"{len(entries)} instances in {len(images)} images, {valid} with a pose; written to {csv}")
+    targets = [t for t in dataset.targets() if t[:2] in images and t.obj_id in (None, *wanted)]
+    print(in_words(unanswered(targets, results, entries)))
 
 
 def run_pipeline(

@@ -90,7 +90,7 @@ def in_words(missing: Sequence[dict[str, Any]], most: int = 3) -> str:
     lines = []
     for reason, entries in by_reason.items():
         names = [describe_target(e["scene_id"], e["im_id"], e["obj_id"]) for e in entries[:most]]
-        more = f" and {len(entries) - most} more targets in scores.json" if len(entries) > most else ""
+        more = f" and {len(entries) - most} more" if len(entries) > most else ""
         count = sum(entry["instances"] for entry in entries)
         lines.append(f"{count} instances without estimate, {reason}: {', '.join(names)}{more}")
     return "\n".join(lines)

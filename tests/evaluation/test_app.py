@@ -173,7 +173,14 @@ def test_scores_of_a_results_file(arguments, reference, tmp_path, monkeypatch, c
     assert scores["target_instances_without_estimate"] == 3
     assert scores["mspd"]["AR"] == pytest.approx(whole["mspd"]["AR"] / 2, abs=0.05)
     assert not (tmp_path / "run" / "shards").exists()
-    assert "AR_MSSD" in capsys.readouterr().out
+    assert whole["without_estimate"] == []
+    ids = [[int(number) for number in row[:3]] for row in rows[-3:]]
+    missing = scores["without_estimate"]
+    assert sorted([m["scene_id"], m["im_id"], m["obj_id"]] for m in missing) == sorted(ids)
+    assert {(m["instances"], m["reason"]) for m in missing} == {(1, "not in the results file")}
+    text = capsys.readouterr().out
+    assert "AR_MSSD" in text
+    assert "3 instances without estimate, not in the results file: object" in text
 
 
 def test_a_test_set_without_ground_truth(arguments, root, reference, tmp_path, monkeypatch, capsys):
@@ -193,6 +200,7 @@ def test_a_test_set_without_ground_truth(arguments, root, reference, tmp_path, m
     scores = json.loads((output / "scores.json").read_text())
     assert scores["computed"] is False
     assert "scene_gt.json" in scores["reason"]
+    assert scores["without_estimate"] == []
     assert (output / NAME).is_file()
 
 

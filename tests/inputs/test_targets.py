@@ -65,7 +65,7 @@ def test_in_words():
     missing = [entry(i, 5, 1, "no detection") for i in range(5)] + [entry(2, 6, 3, "no pose (NO_TEMPLATE)")]
     assert in_words(missing).splitlines() == [
         "5 instances without estimate, no detection: object 5 in image 0 of scene 1, object 5 in image 1 of scene 1, "
-        "object 5 in image 2 of scene 1 and 2 more targets in scores.json",
+        "object 5 in image 2 of scene 1 and 2 more",
         "3 instances without estimate, no pose (NO_TEMPLATE): object 6 in image 2 of scene 1",
     ]
     assert "image 3 of scene 1" in in_words([entry(3, None, 1, "no detection")])
