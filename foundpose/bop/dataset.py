@@ -11,7 +11,7 @@ from foundpose.bop.masks import read_mask
 from foundpose.bop.scenes import Annotation, parse_annotations, parse_depth_scale, parse_intrinsics
 from foundpose.bop.targets import Target, count_visible, describe_target, parse_targets
 from foundpose.bop.vsd import BOP_DELTA
-from foundpose.geometry.symmetries import Symmetries, symmetries_from_models_info
+from foundpose.geometry.symmetries import symmetries_from_models_info
 from foundpose.utils.files import describe_folder
 from foundpose.utils.pictures import read_depth, read_image, read_image_size
 
@@ -95,23 +95,15 @@ class BopDataset:
 
         Raises:
             FileNotFoundError: there is no such file or entry.
-            BopError: the diameter is no positive number.
+            BopError: the diameter is no positive number, or a symmetry is none.
         """
         infos = self._read_models_info(self.models_eval)
         _diameter(self.models_eval, infos, obj_id)
-        return infos[obj_id]
-
-    def evaluation_symmetries(self, obj_id: int) -> Symmetries:
-        """Symmetries of an object as published, float64, B = 1.
-
-        Raises:
-            FileNotFoundError: no such file or entry.
-            BopError: an entry that is no symmetry.
-        """
         try:
-            return symmetries_from_models_info(self.evaluation_info(obj_id))
+            symmetries_from_models_info(infos[obj_id])
         except ValueError as error:
             raise BopError(f"{self.models_eval / 'models_info.json'}, object {obj_id}: {error}") from error
+        return infos[obj_id]
 
     def targets(self) -> list[Target]:
         """What to find, in the file's order.

@@ -51,11 +51,14 @@ def read_mask(
 
 def largest_component(mask: Tensor) -> Tensor:
     """The largest piece of a mask (H, W) bool; pixels that touch at a corner belong together."""
-    pieces, count = ndimage.label(mask.cpu().numpy(), structure=np.ones((3, 3)))
+    box = _box(mask)
+    inside = mask[box].cpu().numpy()
+    pieces, count = ndimage.label(inside, structure=np.ones((3, 3)))
     if count < 2:
         return mask
-    largest = 1 + int(np.bincount(pieces.ravel())[1:].argmax())
-    return torch.from_numpy(pieces == largest).to(mask.device)
+    largest = torch.zeros_like(mask)
+    largest[box] = torch.from_numpy(pieces == 1 + np.bincount(pieces.ravel())[1:].argmax()).to(mask.device)
+    return largest
 
 
 def plausible_mask(mask: Tensor, name: str, keep_largest: bool = True) -> Tensor:
@@ -82,9 +85,9 @@ def plausible_mask(mask: Tensor, name: str, keep_largest: bool = True) -> Tensor
             "A mask is bright (or opaque) on the object"
         )
     largest = largest_component(mask)
-    if _box_area(mask) <= _FAR * _box_area(largest):
+    growth = mask[_box(mask)].numel() / max(largest[_box(largest)].numel(), 1)
+    if growth <= _FAR:
         return mask
-    growth = _box_area(mask) / _box_area(largest)
     left = (
         "all are kept" if not keep_largest else "the others are left out (largest_component=false keeps them)"
     )
@@ -95,6 +98,9 @@ def plausible_mask(mask: Tensor, name: str, keep_largest: bool = True) -> Tensor
     return largest if keep_largest else mask
 
 
-def _box_area(mask: Tensor) -> int:
+def _box(mask: Tensor) -> tuple[slice, slice]:
+    """Rows and columns of the box around a mask."""
     rows, columns = mask.any(dim=1).nonzero(), mask.any(dim=0).nonzero()
-    return int((rows.max() - rows.min() + 1) * (columns.max() - columns.min() + 1)) if len(rows) else 0
+    if not len(rows):
+        return slice(0), slice(0)
+    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)

@@ -14,6 +14,7 @@ from foundpose.bop import (
     detected_instances,
     ground_truth_instances,
 )
+from foundpose.geometry import symmetries_from_models_info
 from foundpose.rendering import load_mesh
 from tests.bop_dataset import DEPTH_SCALE
 
@@ -79,7 +80,9 @@ def test_models_for_evaluation(own_bop):
     assert dataset.has_evaluation_models()
     assert dataset.evaluation_mesh_path(2) == own_bop / "models_eval/obj_000002.ply"
     assert load_mesh(dataset.evaluation_mesh_path(2)).diameter == pytest.approx(dataset.diameter(2), rel=1e-6)
-    assert dataset.evaluation_symmetries(1).transforms.tolist() == [[torch.eye(4).tolist()]]
+    assert symmetries_from_models_info(dataset.evaluation_info(1)).transforms.tolist() == [
+        [torch.eye(4).tolist()]
+    ]
     turn = [-1, 0, 0, 5, 0, -1, 0, 7, 0, 0, 1, 0, 0, 0, 0, 1]
 
     def add_symmetries(infos):
@@ -89,7 +92,7 @@ def test_models_for_evaluation(own_bop):
 
     path = own_bop / "models_eval/models_info.json"
     edit(path, add_symmetries)
-    symmetries = dataset.evaluation_symmetries(1)
+    symmetries = symmetries_from_models_info(dataset.evaluation_info(1))
     assert symmetries.transforms.dtype == torch.float64
     assert symmetries.transforms[0, 1].flatten().tolist() == turn
     assert symmetries.axes.tolist() == [[[0, 0, 1]]]
@@ -103,10 +106,10 @@ def test_models_for_evaluation(own_bop):
     with pytest.raises(
         BopError, match=r"models_info.json, object 1: symmetries_discrete\[0\] must be 16 finite numbers"
     ):
-        dataset.evaluation_symmetries(1)
+        dataset.evaluation_info(1)
     shutil.rmtree(own_bop / "models_eval")
     assert not dataset.has_evaluation_models()
-    for ask in (dataset.evaluation_info, dataset.evaluation_symmetries, dataset.evaluation_mesh_path):
+    for ask in (dataset.evaluation_info, dataset.evaluation_mesh_path):
         with pytest.raises(
             FileNotFoundError, match=r"models_info.json is missing; the folder .*models_eval does not"
         ):
@@ -323,7 +326,7 @@ def test_reads_lmo(lmo_root):
     # The published list was made from earlier visible fractions: about one target in thirty differs.
     visible = dataset.localization_targets([Target(*image, None, None) for image in dataset.images()])
     assert 0 < len(set(visible) ^ set(targets)) < 0.05 * len(targets)
-    assert dataset.evaluation_symmetries(10).transforms.shape == (1, 2, 4, 4)
+    assert symmetries_from_models_info(dataset.evaluation_info(10)).transforms.shape == (1, 2, 4, 4)
     scales = [
         float(torch.linalg.det(a.T_camera_from_model[:3, :3])) ** (1 / 3)
         for image in dataset.images()
