@@ -16,6 +16,7 @@ from foundpose.utils.files import describe_folder
 _PLAIN = ("1", "L", "P", "RGB", "RGBX", "CMYK", "YCbCr", "HSV")
 _WITH_ALPHA = ("LA", "La", "PA", "RGBA", "RGBa")
 _TURNED = (5, 6, 7, 8)
+_EXIF_ENTRIES = {"exif", "Raw profile type exif", "xmp", "XML:com.adobe.xmp"}
 
 
 class PictureError(ValueError):
@@ -68,15 +69,13 @@ def read_picture(path: str | Path) -> Picture:
         # Telephones write MPO: a picture, and others for the depth or the preview.
         if frames > 1 and image.format != "MPO":
             raise PictureError(f"{path} holds {frames} pictures ({image.format}); save the one that is meant")
-        image.load()
-        upright = ImageOps.exif_transpose(image)
-        transparent = "transparency" in upright.info
-        if upright.mode in _WITH_ALPHA or (upright.mode in _PLAIN and transparent):
-            pixels = np.asarray(upright.convert("RGBA"), dtype=np.float32) / 255.0
-        elif upright.mode in _PLAIN:
-            pixels = np.asarray(upright.convert("RGB"), dtype=np.float32) / 255.0
+        ImageOps.exif_transpose(image, in_place=True)
+        if image.mode in _WITH_ALPHA or (image.mode in _PLAIN and "transparency" in image.info):
+            pixels = np.asarray(image.convert("RGBA"), dtype=np.float32) / 255.0
+        elif image.mode in _PLAIN:
+            pixels = np.asarray(image.convert("RGB"), dtype=np.float32) / 255.0
         else:
-            pixels = np.repeat(_deep(upright, image.format, path)[..., None], 3, axis=2)
+            pixels = np.repeat(_deep(image, path)[..., None], 3, axis=2)
     values = torch.from_numpy(pixels).permute(2, 0, 1).contiguous()
     return Picture(values[:3], values[3] if len(values) == 4 else None)
 
@@ -105,8 +104,9 @@ def read_image_size(path: str | Path) -> tuple[int, int]:
     """
     with _opened(Path(path)) as image:
         width, height = image.size
-        # Pillow turns TIFF itself.
-        turned = image.format != "TIFF" and image.getexif().get(ExifTags.Base.Orientation) in _TURNED
+        # Pillow turns TIFF itself. It decodes a PNG without EXIF whole to look for some at the end.
+        may_turn = image.format != "TIFF" and not _EXIF_ENTRIES.isdisjoint(image.info)
+        turned = may_turn and image.getexif().get(ExifTags.Base.Orientation) in _TURNED
     return (width, height) if turned else (height, width)
 
 
@@ -149,11 +149,11 @@ def check_size(name: str, values: Tensor, size: tuple[int, int] | None) -> None:
     )
 
 
-def _deep(image: Image.Image, file_format: str | None, path: str | Path) -> np.ndarray:
+def _deep(image: Image.Image, path: str | Path) -> np.ndarray:
     """Grey of more than 8 bits in [0, 1]: (H, W) float32."""
     values = np.asarray(image)
     # Of what Pillow reads as integers of unknown range, it scales PGM itself.
-    if image.mode.startswith("I;16") or (image.mode == "I" and file_format == "PPM"):
+    if image.mode.startswith("I;16") or (image.mode == "I" and image.format == "PPM"):
         return values.astype(np.float32) / 65535.0
     if image.mode == "F":
         if not np.isfinite(values).all() or values.min() < 0.0 or values.max() > 1.0:
