@@ -22,7 +22,6 @@ from tqdm import tqdm
 from foundpose.bop import (
     BopDataset,
     Instance,
-    plausible_mask,
     read_image,
     read_mask,
     result_file_name,
@@ -73,8 +72,7 @@ def estimate_picture(cfg: DictConfig, output: Path) -> None:
     image = read_image(cfg.image, cfg.background)
     height, width = image.shape[1:]
     if cfg.mask is not None:
-        mask = read_mask(cfg.mask, (height, width))
-        mask = plausible_mask(mask, f"the mask {cfg.mask}", cfg.largest_component)
+        mask = read_mask(cfg.mask, (height, width), cfg.largest_component)
     else:
         box = numbers(cfg, "box", "[x,y,width,height]", 4)
         mask = masks_from_boxes(boxes_from_xywh(torch.tensor([box])), height, width)[0]

@@ -222,7 +222,7 @@ class BopDataset:
 
     def _read_mask(self, folder: str, scene_id: int, im_id: int, annotation_index: int) -> Tensor:
         path = self._scene(scene_id) / folder / f"{im_id:06d}_{annotation_index:06d}.png"
-        return read_mask(path, self.image_size(scene_id, im_id), may_be_empty=True)
+        return read_mask(path, self.image_size(scene_id, im_id), checked=False)
 
     def _scene(self, scene_id: int) -> Path:
         scene = self.split / f"{scene_id:06d}"

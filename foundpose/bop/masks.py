@@ -19,7 +19,8 @@ _FAR = 2.0
 def read_mask(
     path: str | Path,
     size: tuple[int, int] | None = None,
-    may_be_empty: bool = False,
+    largest_component: bool = True,
+    checked: bool = True,
 ) -> Tensor:
     """Read a mask as (H, W) bool.
 
@@ -29,24 +30,25 @@ def read_mask(
     Args:
         path: a picture.
         size: expected (height, width).
-        may_be_empty: accept a mask without a bright pixel.
+        largest_component: of pieces that lie far apart, return the largest alone; see :func:`plausible_mask`.
+        checked: refuse an empty mask, and warn of one that is hardly an object's. False returns what the file holds.
 
     Raises:
         FileNotFoundError: no such file.
-        PictureError: not a picture, one of another size, or (unless ``may_be_empty``) an empty mask.
+        PictureError: not a picture, one of another size, or an empty mask.
     """
     picture = read_picture(path)
     brightness = picture.rgb.amax(dim=0)
     if picture.alpha is not None and bool((picture.alpha != picture.alpha[0, 0]).any()):
         brightness = picture.alpha
     mask = brightness > 0.5
-    if not may_be_empty and not bool(mask.any()):
+    if checked and not bool(mask.any()):
         raise PictureError(
             f"the mask {path} is empty: no pixel is above half of the range (the brightest is "
             f"{round(float(brightness.max()) * 255)} of 255; a mask of zeros and ones must be multiplied by 255)"
         )
     check_size(f"the mask {path}", mask, size)
-    return mask
+    return plausible_mask(mask, f"the mask {path}", largest_component) if checked else mask
 
 
 def largest_component(mask: Tensor) -> Tensor:

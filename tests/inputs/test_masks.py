@@ -88,6 +88,18 @@ def two_pieces(distance):
     return disc(center=(6, 6), radius=5) | disc(center=(6, 6 + distance), radius=4)
 
 
+def test_reading_warns_and_keeps_the_largest_piece(tmp_path):
+    Image.fromarray(stray()).save(tmp_path / "stray.png")
+    for largest in (True, False):
+        with pytest.warns(UserWarning, match=r"the mask .*stray\.png has pieces far apart"):
+            mask = read_mask(tmp_path / "stray.png", SIZE, largest)
+        assert mask.sum() == (69 if largest else 71)
+    assert read_mask(tmp_path / "stray.png", checked=False).sum() == 71
+    Image.fromarray(~disc(radius=4)).save(tmp_path / "inverse.png")
+    with pytest.warns(UserWarning, match=r"the mask .*inverse\.png covers 9\d\.\d% of the picture"):
+        read_mask(tmp_path / "inverse.png")
+
+
 # name, mask, the warning if any, and whether the largest piece alone is left
 PLAUSIBLE = [
     ("disc", disc(), None, False),
