@@ -165,7 +165,7 @@ def test_meshes_are_loaded_once_and_not_at_all_the_next_time(root, tmp_path, loa
     assert len(loads) == 2
     assert torch.equal(found[1].descriptors, first[0].descriptors)
     # The file is the one that the mesh's own checksum leads to.
-    assert again.path(1) == again.store.path(again.mesh(1), again.name(1))
+    assert again.path(1) == again.store.path(again.mesh(1), dataset.object_name(1))
     records = list(tmp_path.glob(".tiny-meshes-*.json"))
     assert len(records) == 1
     assert json.loads(records[0].read_text()) == {str(i): objects.mesh(i).checksum for i in (1, 2)}
