@@ -3,19 +3,29 @@
 Imports pytorch_lightning, as only ``foundpose.evaluation`` does besides.
 """
 
-from foundpose.training.adapter import AdapterTraining, PairLoss, PairPoses
+from foundpose.training.adapter import (
+    AdapterTraining,
+    PairBatch,
+    PairDataModule,
+    PairLoss,
+    PairPoses,
+    PairSettings,
+    PatchPairs,
+    evaluate_scenes,
+    make_pairs,
+)
 from foundpose.training.base import EpochShuffle, RenderedDataModule
-from foundpose.training.data import PairDataModule
 from foundpose.training.errors import PoseErrors, compare, summarize
-from foundpose.training.evaluation import evaluate_refiner, evaluate_scenes
-from foundpose.training.pairs import PairBatch, PairSettings, PatchPairs, make_pairs
-from foundpose.training.refiner import RefinerLoss, RefinerTraining, disentangled_error
-from foundpose.training.refiner_data import (
+from foundpose.training.refiner import (
     Perturbation,
     PictureSettings,
     RefinerBatch,
     RefinerDataModule,
+    RefinerLoss,
     RefinerPictures,
+    RefinerTraining,
+    disentangled_error,
+    evaluate_refiner,
 )
 from foundpose.training.views import (
     TemplateViews,

@@ -11,7 +11,7 @@ from foundpose.pnp import RansacPnp
 from foundpose.retrieval import QueryPatches, TemplateRetriever
 from foundpose.synthetic import cluttered_scene
 from foundpose.training import PoseErrors, compare, evaluate_scenes, summarize
-from foundpose.training.evaluation import GivenTemplates, pose_errors
+from foundpose.training.adapter.evaluation import GivenTemplates, pose_errors
 
 
 def turn(degrees):

@@ -6,8 +6,8 @@ from pathlib import Path
 from foundpose.geometry import PerspectiveCrop, Symmetries
 from foundpose.onboarding import Onboarder, Progress
 from foundpose.rendering import Mesh
+from foundpose.training.adapter.pairs import PairSettings, PatchPairs, make_pairs
 from foundpose.training.base import RenderedDataModule
-from foundpose.training.pairs import PairSettings, PatchPairs, make_pairs
 
 
 class PairDataModule(RenderedDataModule):

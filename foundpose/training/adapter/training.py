@@ -10,8 +10,8 @@ from foundpose.features import ResidualAdapter
 from foundpose.losses import GeodesicRotationLoss, PointMatchingLoss, ProjectionLoss
 from foundpose.matching import SoftPatchMatcher
 from foundpose.pnp import LevenbergMarquardtPnp, RansacPnp
+from foundpose.training.adapter.pairs import PairBatch
 from foundpose.training.base import adam
-from foundpose.training.pairs import PairBatch
 
 
 class PairPoses(NamedTuple):

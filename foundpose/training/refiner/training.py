@@ -10,7 +10,7 @@ from torch import Tensor
 from foundpose.losses import point_matching_error
 from foundpose.refinement import RenderAndCompareRefiner, Views, apply_update, update_between
 from foundpose.training.base import adam
-from foundpose.training.refiner_data import RefinerBatch
+from foundpose.training.refiner.data import RefinerBatch
 
 
 class RefinerLoss(NamedTuple):
