@@ -2,7 +2,7 @@
 
 python experiments/benchmark.py
 python experiments/benchmark.py quick=true
-python experiments/benchmark.py device=cuda batch_sizes=[1,32] extractor=dinov2_vitl14 precision=fp16
+python experiments/benchmark.py device=cuda batch_sizes=[1,32] extractor=dinov2 precision=fp16
 """
 
 from pathlib import Path

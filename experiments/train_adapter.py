@@ -44,15 +44,7 @@ from foundpose.utils.progress import ProgressBars
 TRAINING_OBJECTS, VALIDATION_OBJECTS, HELD_OUT_SCENES = 1000, 2000, 10_000
 MODES = ("retrieved", "nearest")
 # What an option of the config group extractor sets.
-EXTRACTOR_SETTINGS = (
-    "extractor",
-    "sigma",
-    "temperature",
-    "residual",
-    "residual_scale",
-    "auto_scale",
-    "background",
-)
+EXTRACTOR_SETTINGS = ("extractor", "descriptors")
 
 
 @hydra.main(version_base="1.3", config_path="../conf", config_name="train_adapter")
@@ -158,7 +150,7 @@ def with_adapter(cfg: DictConfig, module: AdapterTraining, weights: Path) -> Dic
         "adapter": None,
         "weights": str(weights.resolve()),
     }
-    trained.temperature = float(module.matcher.temperature.detach())
+    trained.descriptors.temperature = float(module.matcher.temperature.detach())
     return trained
 
 

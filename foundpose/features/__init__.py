@@ -5,16 +5,14 @@ Nothing here imports transformers before an extractor that needs it is construct
 
 from foundpose.features.adapter import AdaptedExtractor, ResidualAdapter
 from foundpose.features.base import Fingerprint, PatchExtractor, PatchFeatures
-from foundpose.features.clip import Clip
 from foundpose.features.dense_sift import DenseSift
 from foundpose.features.dinov2 import DinoV2
-from foundpose.features.dinov3 import DinoV3
 from foundpose.features.hook import FeatureHook
 from foundpose.features.loftr import LoftrBackbone
 from foundpose.features.oracle import CoordinateCode, PatchNoise
 from foundpose.features.pca import PcaProjection
 from foundpose.features.s2dnet import S2DNet
-from foundpose.features.sam import Sam
+from foundpose.features.vision_transformer import Clip, DinoV3, Sam, VisionTransformer
 from foundpose.features.weights import WeightsNotFoundError
 
 __all__ = [
@@ -34,5 +32,6 @@ __all__ = [
     "ResidualAdapter",
     "S2DNet",
     "Sam",
+    "VisionTransformer",
     "WeightsNotFoundError",
 ]

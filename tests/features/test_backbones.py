@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from foundpose.features import Clip, DinoV3, LoftrBackbone, S2DNet, Sam
+from foundpose.features import Clip, DinoV2, DinoV3, LoftrBackbone, S2DNet, Sam, VisionTransformer
 from tests.features.backbones import ALL, CLIP, DINOV3, SAM, TRANSFORMERS, make, shake
 
 CHANNELS = {"loftr": 256, "loftr_fine": 128, "s2dnet": 128, "s2dnet_all": 384}
@@ -194,6 +194,22 @@ def test_bad_images_are_refused(name: str, images: Tensor, message: str) -> None
 def test_bad_settings_are_refused(extractor: type, kwargs: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         extractor(**kwargs)
+
+
+@pytest.mark.parametrize(
+    ("family", "depth", "layer"),
+    [(DinoV2, 12, 9), (DinoV2, 24, 18), (DinoV2, 40, 30), (DinoV3, 24, 18), (Clip, 24, 23), (Sam, 24, 23)],
+)
+def test_default_layers_are_the_papers(family: type[VisionTransformer], depth: int, layer: int) -> None:
+    small = {"hidden_size": 8, "num_attention_heads": 2, "num_hidden_layers": depth}
+    extractor = family(weights="random", seed=0, config=small)
+    assert (extractor.layer, extractor.variant) == (layer, family.default_variant)
+    assert extractor.fingerprint()["layer"] == layer
+
+
+def test_sam_has_no_final_norm() -> None:
+    with pytest.raises(ValueError, match="Sam has no final LayerNorm"):
+        make("sam", final_norm=True)
 
 
 def test_nothing_imports_torchvision() -> None:

@@ -14,7 +14,7 @@ TINY = {"hidden_size": 32, "num_hidden_layers": 6, "num_attention_heads": 4, "im
 
 
 def tiny(variant: str = "vits14_reg", layer: int = 3, seed: int = 0, **kwargs) -> DinoV2:
-    return DinoV2.random_init(variant, layer, seed=seed, config=TINY, **kwargs)
+    return DinoV2(variant, layer, seed=seed, config=TINY, **kwargs, weights="random")
 
 
 @pytest.fixture
@@ -35,7 +35,7 @@ def test_shapes_and_dtypes(variant: str, dtype: torch.dtype, images) -> None:
 
 
 def test_paper_setting_at_full_resolution() -> None:
-    extractor = DinoV2.random_init("vits14_reg", layer=1)
+    extractor = DinoV2("vits14_reg", layer=1, weights="random", seed=0)
     with torch.no_grad():
         out = extractor(torch.rand(1, 3, 420, 420))
     assert out.patches.shape == (1, 384, 30, 30)

@@ -1,14 +1,9 @@
 import pytest
 import torch
+from transformers import AutoModel
 
 from foundpose.features.dinov2 import DinoV2
-from foundpose.features.dinov2_checkpoints import (
-    VARIANTS,
-    build_config,
-    hub_repository,
-    model_class,
-    original_checkpoint_url,
-)
+from foundpose.features.dinov2_checkpoints import VARIANTS, original_checkpoint_url
 from foundpose.features.weights import WeightsNotFoundError
 from tests.features import original_dinov2
 
@@ -104,7 +99,7 @@ def test_hub_weights_are_read_from_its_cache(hub_cache, variant: str, repository
 
 
 def test_folder_without_weights(tmp_path) -> None:
-    build_config(VARIANTS["vits14"], 12).save_pretrained(tmp_path)
+    DinoV2.build_config(VARIANTS["vits14"], 12).save_pretrained(tmp_path)
     with pytest.raises(WeightsNotFoundError, match="hf download facebook/dinov2-small"):
         DinoV2("vits14", layer=9, weights=tmp_path)
 
@@ -149,14 +144,14 @@ def test_incomplete_and_foreign_files_are_refused(tmp_path) -> None:
 )
 def test_variants_have_the_published_sizes(variant: str, millions: float) -> None:
     for name in (variant, f"{variant}_reg"):
-        architecture = VARIANTS[name]
+        sizes = DinoV2.variants[name]
         with torch.device("meta"):
-            model = model_class(architecture)(build_config(architecture, architecture.num_hidden_layers))
+            model = AutoModel.from_config(DinoV2.build_config(sizes, sizes["num_hidden_layers"]))
         count = sum(p.numel() for p in model.parameters())
         assert count / 1e6 == pytest.approx(millions, rel=2e-3)
 
 
 def test_addresses() -> None:
-    assert hub_repository("vits14") == "facebook/dinov2-small"
-    assert hub_repository("vitg14_reg") == "facebook/dinov2-with-registers-giant"
+    assert DinoV2.hub_repository("vits14") == "facebook/dinov2-small"
+    assert DinoV2.hub_repository("vitg14_reg") == "facebook/dinov2-with-registers-giant"
     assert original_checkpoint_url("vitb14").endswith("/dinov2_vitb14/dinov2_vitb14_pretrain.pth")

@@ -114,7 +114,7 @@ class TestPca:
     [
         DenseSift(supports=(28.0, 42.0)),
         DenseSift(rootsift=True),
-        DinoV2.random_init("vits14_reg", 2, config=TINY).double(),
+        DinoV2("vits14_reg", 2, config=TINY, weights="random", seed=0).double(),
         CoordinateCode(channels=16),
         PatchNoise(CoordinateCode(channels=16), fraction=0.5),
     ],
@@ -213,7 +213,7 @@ def test_hook_and_extractor_leave_requires_grad_alone() -> None:
     assert module.blocks[0].weight.grad is None
     assert module.blocks[1].weight.grad is not None
 
-    extractor = DinoV2.random_init("vits14_reg", 2, config=TINY)
+    extractor = DinoV2("vits14_reg", 2, config=TINY, weights="random", seed=0)
     assert all(p.requires_grad for p in extractor.parameters())
     extractor.requires_grad_(False)
     images = pictures(1, 56).detach().float().requires_grad_()
@@ -226,7 +226,7 @@ def test_hook_and_extractor_leave_requires_grad_alone() -> None:
 def test_dinov2_gradients_under_autocast_are_those_of_full_precision() -> None:
     gradients = {}
     for precision in (None, "bf16"):
-        extractor = DinoV2.random_init("vits14_reg", 2, precision=precision, config=TINY)
+        extractor = DinoV2("vits14_reg", 2, precision=precision, config=TINY, weights="random", seed=0)
         images = pictures(2, 56).detach().float().requires_grad_()
         patches = extractor(images).patches
         weights = randn(*patches.shape, seed=3).float()

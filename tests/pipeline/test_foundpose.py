@@ -273,7 +273,7 @@ def test_bad_input(scene, oracle_blob):
 def small_transformer(blob, seed=0):
     """A small DINOv2 with random weights, an object onboarded with it, and a picture."""
     size = {"hidden_size": 48, "num_attention_heads": 3, "num_hidden_layers": 2}
-    extractor = DinoV2.random_init("vits14_reg", layer=1, seed=seed, config=size)
+    extractor = DinoV2("vits14_reg", layer=1, seed=seed, config=size, weights="random")
     bow = SoftAssignBow(sigma=1.0)
     onboarder = Onboarder(
         RaycastRenderer(), extractor, SuperFibonacci(20), VisualWords(50), bow, projection=PcaProjection(32)

@@ -87,7 +87,7 @@ def test_pnp_robust_loss_and_temperature_are_choices():
     assert len(training.pnp.draws) == 77
     assert type(training.pnp.polish.loss) is BarronLoss
     # Each extractor has the temperature that suits its descriptors.
-    for option, temperature in (("dense_sift", 0.1), ("dinov2_random", 5.0)):
+    for option, temperature in (("dense_sift", 0.1), ("dinov2", 5.0)):
         assert float(new_training(f"extractor={option}").matcher.temperature) == pytest.approx(temperature)
 
 
@@ -117,7 +117,8 @@ def test_the_extractor_written_is_complete(tmp_path):
     """For any extractor, not only DenseSIFT."""
     names = app()
     small = "{hidden_size: 24, num_attention_heads: 2, num_hidden_layers: 1}"
-    cfg = load("extractor=dinov2_random", f"extractor.config={small}", "extractor.layer=0", "sigma=7.0")
+    random = ["extractor=dinov2", "extractor.weights=random", "extractor.seed=0"]
+    cfg = load(*random, f"extractor.config={small}", "descriptors.sigma=7.0")
     module = instantiate(cfg.training, adapter=ResidualAdapter(24, 8))
     with torch.no_grad():
         module.adapter.outer.weight.fill_(0.1)
@@ -132,9 +133,9 @@ def test_the_extractor_written_is_complete(tmp_path):
     assert isinstance(extractor, AdaptedExtractor)
     inner = instantiate(cfg.extractor)
     assert extractor.fingerprint() == AdaptedExtractor(inner, module.adapter).fingerprint()
-    assert (found.sigma, found.residual, found.residual_scale) == (7.0, cfg.residual, cfg.residual_scale)
+    assert found.descriptors == {**cfg.descriptors, "temperature": found.descriptors.temperature}
     assert found.bow.sigma == 7.0
-    assert found.temperature == pytest.approx(5.0 * math.e, rel=1e-4)
+    assert found.descriptors.temperature == pytest.approx(5.0 * math.e, rel=1e-4)
 
 
 def test_train_resume_and_refuse(monkeypatch, tmp_path, capsys, bodies):
@@ -201,17 +202,18 @@ def test_train_resume_and_refuse(monkeypatch, tmp_path, capsys, bodies):
             run_app(monkeypatch, tmp_path, *overrides)
         assert message in capsys.readouterr().err
 
-    # The adapter serves every app as an extractor: by the option written beside it, or the one for DenseSIFT.
+    # The adapter serves every app as an extractor: by the option written beside it.
     capsys.readouterr()
     arguments = ["demo.py", "--config-dir", str(run), "extractor=adapted", "--cfg", "job"]
     monkeypatch.setattr(sys, "argv", arguments)
     runpy.run_path(str(ROOT / "experiments" / "demo.py"), run_name="__main__")
     written = OmegaConf.create(capsys.readouterr().out)
     with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        path = run / "adapter.safetensors"
-        cfg = compose("demo", overrides=["extractor=adapted_dense_sift", f"extractor.weights={path}"])
+        cfg = compose("demo", overrides=[f"hydra.searchpath=[{run}]", "extractor=adapted"])
+    path = run / "adapter.safetensors"
     assert written.extractor == cfg.extractor
-    assert written.sigma == cfg.sigma == 0.3
+    assert written.extractor.weights == str(path.resolve())
+    assert written.descriptors.sigma == 0.3
     cfg.representations = str(tmp_path)
     extractor = build_method(cfg).pipeline.extractor
     assert extractor.adapter.checksum() == ResidualAdapter.load(path).checksum()

@@ -31,7 +31,7 @@ def arguments(root):
 def test_settings_are_literal_and_once():
     settings = run_settings(load("ablate", "extractor=dense_sift", "words.num_words=77"))
     assert settings["words.num_words"] == 77
-    assert settings["sigma"] == 0.3
+    assert settings["descriptors.sigma"] == 0.3
     assert settings["onboarder.idf_mode"] == "document"
     assert "onboarder.words.num_words" not in settings
     assert "bow.sigma" not in settings
@@ -46,7 +46,7 @@ def test_folders_tell_settings_apart_and_nothing_else(tmp_path):
     same = ["trainer.devices=4", "device=cuda", "representations=elsewhere", "method=other", "errors=[mssd]"]
     assert folder(*same, "data_module.num_workers=3", "memory_limit=100") == base
     assert folder("pnp.iterations=200") != base
-    assert folder("sigma=3") != base
+    assert folder("descriptors.sigma=3") != base
     assert folder("data.split=val") != base
     assert folder("data.root=/somewhere/lmo").name.startswith("lmo-")
     # Two rows of the paper that are one experiment, and a default that is spelled out.
