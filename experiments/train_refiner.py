@@ -2,6 +2,7 @@
 
 python experiments/train_refiner.py
 python experiments/train_refiner.py meshes=[a.ply,b.ply,c.ply] held_out=d.ply
+python experiments/train_refiner.py refiner=megapose
 """
 
 import time
@@ -20,7 +21,7 @@ from safetensors.torch import save_file
 from torch import nn
 
 from foundpose.config import claim_run_folder, clear_errors
-from foundpose.refinement import RenderAndCompareRefiner, UpdateNetwork
+from foundpose.refinement import MegaPoseNetwork, RenderAndCompareRefiner, UpdateNetwork
 from foundpose.rendering import Mesh, load_mesh
 from foundpose.training import (
     RefinerDataModule,
@@ -76,7 +77,9 @@ def run(cfg: DictConfig, output: Path) -> None:
     print_table(results)
     print("seconds: " + ", ".join(f"{name} {value:.0f}" for name, value in seconds.items()))
     print(f"network: {weights}")
-    print(f"use it with: refiner=render_and_compare refiner.network.weights={weights}")
+    print(
+        f"use it with: refiner={HydraConfig.get().runtime.choices['refiner']} refiner.network.weights={weights}"
+    )
 
 
 def timed(seconds: dict[str, float], name: str, step: Callable[[], _T]) -> _T:
@@ -114,7 +117,7 @@ def train(
 
 def save_network(network: nn.Module, path: Path) -> None:
     """Write the network; one that cannot write itself as its plain tensors."""
-    if isinstance(network, UpdateNetwork):
+    if isinstance(network, UpdateNetwork | MegaPoseNetwork):
         network.save(path)
     else:
         tensors = {name: value.detach().cpu().contiguous() for name, value in network.state_dict().items()}

@@ -43,6 +43,7 @@ SMALL = {
     "loftr": [],
     "s2dnet": [],
 }
+SMALL_MEGAPOSE = ["megapose.weights=random", "megapose.seed=0", "megapose.width=4"]
 
 
 def load(name="config", *overrides):
@@ -94,7 +95,7 @@ def test_every_option_is_instantiated(group, option, tiny_bop, monkeypatch):
     if group == "extractor" and option.startswith(tuple(SMALL)):
         overrides += SMALL[next(name for name in SMALL if option.startswith(name))]
         overrides += ["extractor.weights=random", "extractor.seed=0"]
-    cfg = load("config", *overrides)
+    cfg = load("config", *overrides, *SMALL_MEGAPOSE)
     if group == "data":
         cfg.data.root, cfg.data.split, cfg.data.models = str(tiny_bop), "test", "models"
     if group == "extractor":
@@ -167,6 +168,7 @@ DELIBERATE = {
     # (group, option): keys that are what the option is about.
     ("bow", "hard_assign"): {"num_nearest"},
     ("matcher", "cyclic"): {"mode", "top_k"},
+    ("retrieval", "every_template"): {"num_templates"},
     ("matcher", "soft"): {"temperature"},
     ("pnp", "p3p_ransac"): {"guidance"},
     ("pnp", "soft_ransac"): {"guidance"},

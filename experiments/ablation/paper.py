@@ -20,6 +20,7 @@ class PaperRow:
         refinement: refinement stage, None where there is none (or the table has no such column).
         no_training: whether the method needs no training for the task; None where the table does not say.
         ours: whether the row is a variant of FoundPose, which this library runs.
+        peer: whether it is another method that this library runs, made of the same parts.
         average_recall: AR in percent by dataset; None where none is printed.
         average: mean AR, percent.
         time: seconds per image.
@@ -32,6 +33,7 @@ class PaperRow:
     refinement: str | None
     no_training: bool | None
     ours: bool
+    peer: bool
     average_recall: dict[str, float | None]
     average: float | None
     time: float | None
@@ -151,6 +153,7 @@ def _row(table: int, facts: dict[str, Any]) -> PaperRow:
         refinement=facts.get("refinement"),
         no_training=facts.get("no_training"),
         ours=facts.get("ours", False),
+        peer=facts.get("peer", False),
         average_recall=dict(zip(names, facts["AR"], strict=True)),
         average=facts["average"],
         time=facts["time"],

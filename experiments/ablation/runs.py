@@ -32,6 +32,7 @@ _ROW_MAY_CHANGE = (
     *("data", "masks.path", "objects", "max_images"),
     *("trainer", "device", "data_module", "evaluation", "errors", "memory_limit"),
     *("extractor.weights", "extractor.seed", "extractor.config"),
+    *("megapose.weights", "megapose.seed"),
 )
 _WHOLE_REFERENCE = re.compile(r"\$\{[^}]*\}")
 _FORMATS: tuple[tuple[str, Format], ...] = ((".md", "markdown"), (".tex", "latex"))
@@ -147,7 +148,9 @@ def _dataset(cfg: DictConfig) -> str:
 def _label(settings: Mapping[str, Any]) -> str | None:
     """Why a run's figures mean nothing, if so."""
     # An extractor may wrap another one.
-    weights = [value for key, value in settings.items() if re.fullmatch(r"(extractor\.)+weights", key)]
+    weights = [
+        v for key, v in settings.items() if re.fullmatch(r"(extractor\.)+weights|megapose\.weights", key)
+    ]
     return "random weights: the figures mean nothing" if "random" in weights else None
 
 

@@ -31,10 +31,10 @@ class _Ours(NamedTuple):
 def paper_table(records: Sequence[RunRecord], table: int, format: Format = "markdown") -> str:
     """One of the paper's tables in its own form, with our figures and the differences below the paper's.
 
-    Every row of the paper keeps its place. Rows of FoundPose have a second line with our figures, and a third with
-    ours minus the paper's where there are any. What there is no figure for is marked –. An AR of ours stands in the
-    table only if it is one: all three errors, on all test targets of the dataset. Anything less is in a note, as are
-    failures. Runs with a label say only that they ran.
+    Every row of the paper keeps its place. Rows that this library runs have a second line with our figures, and a
+    third with ours minus the paper's where there are any. What there is no figure for is marked –. An AR of ours
+    stands in the table only if it is one: all three errors, on all test targets of the dataset. Anything less is in
+    a note, as are failures. Runs with a label say only that they ran.
 
     Args:
         records: of any runs; those of this table's rows are taken (``RunRecord.row``).
@@ -68,7 +68,7 @@ def paper_table(records: Sequence[RunRecord], table: int, format: Format = "mark
             # The paper sets its best figures in bold in the first table only.
             styles = _styles(row, ranked) if with_refinement else [_PLAIN] * len(numbers)
             text.rows.append(_paper_line(row, styles, with_refinement))
-            if row.ours:
+            if row.ours or row.peer:
                 ours = [_ours(_pick(runs, row, dataset.name), dataset) for dataset in datasets]
                 text.rows += _our_lines(row, ours, text, len(facts))
     timing = paper_numbers()["timing"]

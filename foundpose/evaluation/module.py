@@ -84,7 +84,7 @@ class PoseEvaluation(pl.LightningModule):
         """Poses of some regions, whose images have one size, and the time that took."""
         images = sorted({batch.image_index[i] for i in members})
         ids = sorted({batch.object_ids[i] for i in members})
-        meshes = None if self.pipeline.refiner is None else [self.objects.mesh(obj_id) for obj_id in ids]
+        meshes = [self.objects.mesh(obj_id) for obj_id in ids] if self.pipeline.needs_meshes else None
         start = time.perf_counter()
         estimates = self.pipeline(
             torch.stack([batch.images[i] for i in images]),

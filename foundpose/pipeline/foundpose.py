@@ -1,7 +1,6 @@
 """The composed method: from images and masks to poses."""
 
 from collections.abc import Sequence
-from typing import get_args
 
 import torch
 from torch import Tensor, nn
@@ -14,7 +13,7 @@ from foundpose.pipeline.refining import RefineWhat, refine_estimates
 from foundpose.pipeline.results import PoseEstimates
 from foundpose.pipeline.selection import choose_coarse
 from foundpose.refinement import Observation, PoseRefiner
-from foundpose.rendering import Mesh
+from foundpose.rendering import Mesh, Renderer
 from foundpose.representation import ObjectGroups, ObjectRepresentation, RepresentationInfo, take_rows
 from foundpose.retrieval import Retriever
 from foundpose.utils.warn import warn_caller
@@ -56,9 +55,9 @@ class FoundPose(nn.Module):
         hypotheses: finds a pose for each retrieved template: :class:`MatchAndSolve`, the paper's, or
             :class:`TemplateHypotheses`, which matches nothing.
         refiner: improves poses; None returns coarse ones.
-        refine: "best": refine the best hypothesis. "all": refine those of all retrieved templates and keep the one
-            whose refined pose is best: by the hypotheses' scorer, or by the refiner's own score where that looks at
-            inliers only.
+        refine: "best": refine the best hypothesis. "all", or a number: refine those of all retrieved templates, or so
+            many with the best scores, and keep the one whose refined pose is best: by the hypotheses' scorer, or by
+            the refiner's own score where that looks at inliers only.
     """
 
     def __init__(
@@ -71,8 +70,8 @@ class FoundPose(nn.Module):
         refine: RefineWhat = "best",
     ) -> None:
         super().__init__()
-        if refine not in get_args(RefineWhat):
-            raise ValueError(f"refine must be one of {get_args(RefineWhat)}, got {refine!r}")
+        if refine not in ("best", "all") and not (isinstance(refine, int) and refine >= 1):
+            raise ValueError(f"refine must be best, all or a number of at least 1, got {refine!r}")
         self.crop = crop
         self.extractor = extractor
         self.retriever = retriever
@@ -143,6 +142,11 @@ class FoundPose(nn.Module):
             if self.refiner is None:
                 return estimates
             return refine_estimates(estimates, observation, self.hypotheses, self.refiner, self.refine)
+
+    @property
+    def needs_meshes(self) -> bool:
+        """Whether poses are refined, or anything is rendered: meshes may be left out otherwise."""
+        return self.refiner is not None or any(isinstance(module, Renderer) for module in self.modules())
 
     def _check_objects(self, objects: list[ObjectRepresentation]) -> None:
         if not objects:

@@ -12,7 +12,7 @@ from foundpose.pipeline.selection import better_of_two
 from foundpose.pipeline.verification import HypothesisScorer, InlierScore
 from foundpose.pnp import PnpResult, RansacPnp, TemplateStart, TopTemplatePose
 from foundpose.pnp.soft_selection import choose_softly
-from foundpose.refinement import Observation
+from foundpose.refinement import Observation, PoseProposals, PoseRefiner
 from foundpose.representation import ObjectRepresentation, take_rows
 from foundpose.retrieval import QueryPatches, RetrievedTemplates
 
@@ -178,17 +178,20 @@ class MatchAndSolve(HypothesisMaker):
 class TemplateHypotheses(HypothesisMaker):
     """The templates' own poses, moved so that the object's bounding circle is that of the mask; nothing is matched.
 
-    As good as the templates are similar.
+    As good as the templates are similar, or as the scorer judges: with all templates and MegaPose's coarse network it
+    is MegaPose's coarse stage.
 
     Args:
         pose: aligns templates; None means ``TopTemplatePose()``.
+        scorer: a refiner whose scores are taken, and its poses; None: the similarity of the templates is the score.
 
-    Source: paper, Table 2, row 10.
+    Source: paper, Table 2, row 10; Labbé et al., "MegaPose", CoRL 2022.
     """
 
-    def __init__(self, pose: TopTemplatePose | None = None) -> None:
+    def __init__(self, pose: TopTemplatePose | None = None, scorer: PoseRefiner | None = None) -> None:
         super().__init__()
         self.pose = TopTemplatePose() if pose is None else pose
+        self.scorer = scorer
 
     def forward(self, templates: RetrievedTemplates, observation: Observation) -> Hypothesised:
         """Align the templates of each crop with its mask."""
@@ -196,11 +199,18 @@ class TemplateHypotheses(HypothesisMaker):
         poses = observation.groups.map(
             lambda obj, rows: self.pose(crops.masks[rows], crops.K_crop[rows], templates.index[rows], obj)
         )
+        status = poses.status.masked_fill(~templates.valid, int(PoseStatus.NO_TEMPLATE))
+        T, score = poses.T_crop_from_model, templates.similarity
+        if self.scorer is not None:
+            valid = status == PoseStatus.OK
+            scored = self.scorer(PoseProposals(T, score, valid, templates.index), observation)
+            T, score = scored.T_crop_from_model, scored.score
+            status = status.masked_fill(valid & ~scored.valid, int(PoseStatus.DEGENERATE))
         hypotheses = PoseHypotheses(
-            T_crop_from_model=poses.T_crop_from_model,
+            T_crop_from_model=T,
             inliers=torch.zeros_like(templates.valid).unsqueeze(-1)[..., :0],
-            num_inliers=torch.zeros_like(poses.status),
-            status=poses.status.masked_fill(~templates.valid, int(PoseStatus.NO_TEMPLATE)),
-            score=templates.similarity,
+            num_inliers=torch.zeros_like(status),
+            status=status,
+            score=score,
         )
         return Hypothesised(hypotheses)

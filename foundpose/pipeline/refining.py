@@ -11,7 +11,7 @@ from foundpose.pipeline.results import PoseEstimates, PoseStatus
 from foundpose.pipeline.selection import first_of_best
 from foundpose.refinement import Observation, PoseProposals, PoseRefiner
 
-RefineWhat = Literal["best", "all"]
+RefineWhat = Literal["best", "all"] | int
 
 
 def refine_estimates(
@@ -21,15 +21,12 @@ def refine_estimates(
     refiner: PoseRefiner,
     refine: RefineWhat,
 ) -> PoseEstimates:
-    """Refine the chosen hypothesis of each crop, or all, and keep the refined pose with the best score.
+    """Refine the chosen hypothesis of each crop, all, or so many with the best scores; keep the best refined pose.
 
     A crop of which none could be refined keeps its coarse pose. Scores are those of the hypotheses' scorer, or the
     refiner's own where that looks at inliers only.
     """
-    B, h = estimates.hypotheses.num_inliers.shape
-    rank = torch.arange(h, device=estimates.best.device).expand(B, h)
-    if refine == "best":
-        rank = estimates.best[:, None]
+    rank = _which(estimates, refine)
     num_inliers = estimates.hypotheses.num_inliers.gather(1, rank)
     proposals = _propose(estimates, rank)
     refined: PoseProposals = refiner(proposals, observation)
@@ -56,6 +53,19 @@ def refine_estimates(
         best=keep(rank, estimates.best),
         refined=refined,
     )
+
+
+def _which(estimates: PoseEstimates, refine: RefineWhat) -> Tensor:
+    """Numbers (B, n) of the hypotheses to refine."""
+    hypotheses = estimates.hypotheses
+    if refine == "best":
+        return estimates.best[:, None]
+    if refine == "all":
+        return torch.arange(hypotheses.score.shape[1], device=estimates.best.device).expand_as(
+            hypotheses.score
+        )
+    score = hypotheses.score.detach().masked_fill(hypotheses.status != PoseStatus.OK, -torch.inf)
+    return score.sort(dim=1, descending=True, stable=True).indices[:, :refine]
 
 
 def _propose(estimates: PoseEstimates, rank: Tensor) -> PoseProposals:

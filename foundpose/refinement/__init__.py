@@ -4,6 +4,7 @@ from foundpose.refinement.base import Observation, PoseProposals, PoseRefiner
 from foundpose.refinement.cost import AlignmentProblem, FeatureMaps
 from foundpose.refinement.featuremetric import Alignment, FeaturemetricAlignment
 from foundpose.refinement.interpolation import sample_features
+from foundpose.refinement.megapose import MegaPoseNetwork, MegaPoseRefiner, MegaPoseScorer
 from foundpose.refinement.network import UpdateNetwork
 from foundpose.refinement.pose_update import apply_update, rotation_from_6d, rotation_to_6d, update_between
 from foundpose.refinement.refiners import FeaturemetricRefiner, RefinerChain, alignment_problem
@@ -15,6 +16,9 @@ __all__ = [
     "FeatureMaps",
     "FeaturemetricAlignment",
     "FeaturemetricRefiner",
+    "MegaPoseNetwork",
+    "MegaPoseRefiner",
+    "MegaPoseScorer",
     "Observation",
     "PicturedObjects",
     "PoseProposals",

@@ -98,6 +98,8 @@ class RenderAndCompareRefiner(PoseRefiner):
         margin: side of the pictures as a multiple of the object's extent (of twice the farthest that it reaches from
             its centre).
         antialias: filter the picture where a crop shrinks it.
+        keep_graph: do not detach poses before an iteration: the gradient is that of all updates, through the cameras
+            but not through the renderings, and reaches the initial poses.
 
     Raises:
         ValueError: a setting out of range.
@@ -113,6 +115,7 @@ class RenderAndCompareRefiner(PoseRefiner):
         size: int = 64,
         margin: float = 1.4,
         antialias: bool = True,
+        keep_graph: bool = False,
     ) -> None:
         super().__init__()
         if iterations < 1 or size < 2 or not margin >= 1.0:
@@ -125,6 +128,7 @@ class RenderAndCompareRefiner(PoseRefiner):
         self.size = size
         self.margin = margin
         self.antialias = antialias
+        self.keep_graph = keep_graph
 
     def forward(self, proposals: PoseProposals, observation: Observation) -> PoseProposals:
         """Refine all valid proposals as one batch.
@@ -173,13 +177,13 @@ class RenderAndCompareRefiner(PoseRefiner):
     def refine(self, T_camera_from_model: Tensor, pictured: PicturedObjects) -> ComparedPoses:
         """Refine M poses (M, 4, 4), mesh units, of objects in pictures.
 
-        Differentiable w.r.t. the network's parameters and the pictures. Renderings and virtual cameras are constants,
-        and between iterations the pose is detached, as in CosyPose: the gradient is that of the last update.
+        Differentiable w.r.t. the network's parameters and the pictures. Renderings are constants, and poses are
+        detached before each iteration, as in CosyPose: the gradient is that of the last update (see ``keep_graph``).
         """
         T, valid = T_camera_from_model, torch.ones_like(pictured.mesh_index, dtype=torch.bool)
         logit: Tensor | None = None
         for _ in range(self.iterations):
-            views = self.look(T.detach(), pictured)
+            views = self.look(T if self.keep_graph else T.detach(), pictured)
             update, logit = self.predict(views)
             valid = valid & views.valid
             T = self.move(views, update)
@@ -187,9 +191,12 @@ class RenderAndCompareRefiner(PoseRefiner):
         return ComparedPoses(torch.where(valid[:, None, None], T, T_camera_from_model), logit, valid)
 
     def look(self, T_camera_from_model: Tensor, pictured: PicturedObjects) -> Views:
-        """What the network sees of objects at poses (M, 4, 4); differentiable w.r.t. the pictures."""
+        """What the network sees of objects at poses (M, 4, 4).
+
+        Differentiable w.r.t. the pictures and, but for the renderings, the poses.
+        """
         images = pictured.images.to(torch.promote_types(pictured.images.dtype, torch.float32))
-        valid, boxes, T, K_camera, centre = self._usable(T_camera_from_model.detach(), pictured)
+        valid, boxes, T, K_camera, centre = self._usable(T_camera_from_model, pictured)
         K_view, T_view_from_camera = camera_on_boxes(boxes, K_camera, self.size, 1.0 / self.margin)
         T_view = T_view_from_camera @ T
         homographies = K_view @ T_view_from_camera[:, :3, :3] @ torch.linalg.inv(K_camera)

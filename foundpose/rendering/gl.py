@@ -4,6 +4,7 @@ import os
 from functools import partial
 from pathlib import Path
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,25 +53,26 @@ class FaceRasterizer:
         self.scene = pyrender.Scene()
         self.camera = pyrender.IntrinsicsCamera(1.0, 1.0, 0.0, 0.0)
         self.scene.add(self.camera)
-        self.node: Any = None
-        self.checksum = ""
+        self.nodes: WeakKeyDictionary[Mesh, Any] = WeakKeyDictionary()
 
     def set_mesh(self, mesh: Mesh) -> None:
-        """Upload a mesh unless it is the one before."""
-        if mesh.checksum == self.checksum:
-            return
+        """Draw a mesh from now on; meshes stay uploaded as long as they live."""
+        for node in self.scene.mesh_nodes - set(self.nodes.values()):
+            self.scene.remove_node(node)
+        if mesh not in self.nodes:
+            self.nodes[mesh] = self._upload(mesh)
+        self.node = self.nodes[mesh]
+
+    def _upload(self, mesh: Mesh) -> Any:
         if len(mesh.faces) >= 2**23:
             raise ValueError(
                 f"PyrenderRenderer takes meshes of up to {2**23 - 1} faces, got {len(mesh.faces)}"
             )
-        if self.node is not None:
-            self.scene.remove_node(self.node)
         faces = mesh.faces.numpy()
         # The pass culls back faces, but both sides are to be seen.
         both = np.concatenate([faces, faces[:, ::-1]])
         primitive = self.pyrender.Primitive(positions=mesh.vertices.numpy(), indices=both)
-        self.node = self.scene.add(self.pyrender.Mesh([primitive]))
-        self.checksum = mesh.checksum
+        return self.scene.add(self.pyrender.Mesh([primitive]))
 
     def faces_seen(self, view: View, offset: tuple[float, float]) -> NDArray[np.int64]:
         """(H, W) face at each pixel centre moved by ``offset`` (u, v), −1 on the background."""

@@ -8,7 +8,7 @@ from foundpose.retrieval.bow import (
     WordAssignment,
     inverse_document_frequency,
 )
-from foundpose.retrieval.retriever import ClsRetriever, TemplateRetriever
+from foundpose.retrieval.retriever import ClsRetriever, EveryTemplate, TemplateRetriever
 from foundpose.retrieval.spatial import SpatialReranker
 from foundpose.retrieval.votes import PatchVoteRetriever
 from foundpose.retrieval.words import VisualWords
@@ -16,6 +16,7 @@ from foundpose.retrieval.words import VisualWords
 __all__ = [
     "BowNormalization",
     "ClsRetriever",
+    "EveryTemplate",
     "IdfMode",
     "PatchVoteRetriever",
     "QueryPatches",

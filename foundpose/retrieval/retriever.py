@@ -1,4 +1,4 @@
-"""Retrieval of the templates that look most like a crop, by one descriptor for each."""
+"""Retrieval of the templates that look most like a crop, by one descriptor for each; or of all."""
 
 from foundpose.representation import ObjectRepresentation
 from foundpose.retrieval.base import (
@@ -98,4 +98,17 @@ class ClsRetriever(Retriever):
                 f"{tuple(query.cls.shape)} and {tuple(templates.shape)}"
             )
         similarity = normalize_rows(query.cls) @ normalize_rows(templates).T
+        return select_templates(similarity, query.valid.any(dim=1), self.num_templates)
+
+
+class EveryTemplate(Retriever):
+    """All templates of an object, in their order, for stages that look at each.
+
+    Args:
+        num_templates: number h of templates per crop; what an object has fewer is not valid.
+    """
+
+    def forward(self, query: QueryPatches, index: ObjectRepresentation) -> RetrievedTemplates:
+        """The first h templates for each of B crops with valid patches, all with similarity 0."""
+        similarity = index.T_template_from_model.new_zeros(len(query.valid), len(index.T_template_from_model))
         return select_templates(similarity, query.valid.any(dim=1), self.num_templates)

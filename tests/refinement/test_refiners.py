@@ -160,7 +160,7 @@ def test_gradients_pass_through_refinement(views, oracle_blob):
 
 
 def test_bad_arguments():
-    with pytest.raises(ValueError, match="refine must be one of"):
+    with pytest.raises(ValueError, match="refine must be best, all or a number"):
         make_pipeline(refine="some")
 
 

@@ -8,9 +8,12 @@ from foundpose.refinement.megapose.geometry import (
     sample_boxes,
 )
 from foundpose.refinement.megapose.network import MegaPoseNetwork
+from foundpose.refinement.megapose.refiner import MegaPoseRefiner, MegaPoseScorer
 
 __all__ = [
     "MegaPoseNetwork",
+    "MegaPoseRefiner",
+    "MegaPoseScorer",
     "crop_boxes",
     "crop_intrinsics",
     "front_views",

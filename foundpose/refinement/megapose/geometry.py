@@ -109,7 +109,12 @@ def sample_boxes(images: Tensor, boxes: Tensor, image_index: Tensor, size: tuple
     left, top, right, bottom = boxes.to(images.dtype).unbind(-1)
     columns = _sampling_matrix(left, right, size[1], images.shape[-1])
     rows = _sampling_matrix(top, bottom, size[0], images.shape[-2])
-    return rows.unsqueeze(1) @ images[image_index] @ columns.unsqueeze(1).transpose(-1, -2)
+    rows, columns = rows.unsqueeze(1), columns.unsqueeze(1).transpose(-1, -2)
+    crops = images.new_zeros(len(boxes), images.shape[1], *size)
+    for picture in image_index.unique().tolist():
+        of_picture = torch.nonzero(image_index == picture).flatten()
+        crops[of_picture] = rows[of_picture] @ images[picture] @ columns[of_picture]
+    return crops
 
 
 def _sampling_matrix(low: Tensor, high: Tensor, count: int, length: int) -> Tensor:
@@ -143,7 +148,6 @@ def normal_colors(normals: Tensor, mask: Tensor) -> Tensor:
     x, y, z = normals.unbind(-3)
     place = torch.stack([x, z, -y], dim=-3) * _TEXELS - 0.5
     first = place.floor()
-    texels = (torch.arange(_TEXELS, device=normals.device) * 255 // _TEXELS).to(normals.dtype) / 255.0
-    index = first.long() % _TEXELS
-    color = torch.lerp(texels[index], texels[(index + 1) % _TEXELS], place - first)
+    low, high = (((index % _TEXELS) * (255.0 / _TEXELS)).floor_() for index in (first, first + 1.0))
+    color = torch.lerp(low, high, place - first) / 255.0
     return color * mask.unsqueeze(-3)

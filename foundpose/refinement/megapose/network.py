@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
@@ -19,6 +19,8 @@ _RUNS: dict[Head, str] = {"pose": "refiner-rgb-653307694", "score": "coarse-rgb-
 _BLOCKS = (3, 4, 6, 3)  # ResNet-34's
 _CHECKPOINT = "checkpoint.pth.tar"
 _FILES = (_CHECKPOINT, "model.safetensors", "pytorch_model.bin")
+# What an output of one unit means: a quarter in a column of a rotation, 16 pixels, an eighth of the depth.
+_UNITS = (0.25, 0.25, 0.25, 0.25, 0.25, 0.25, 16.0, 16.0, 0.125)
 # Beginnings of keys in older checkpoints, and what they are called now.
 _OLDER = {"backbone.backbone.": "backbone.", "backbone.head.0.": "views_logits_head."}
 
@@ -61,13 +63,9 @@ class MegaPoseNetwork(nn.Module):
             torch.manual_seed(0 if seed is None else seed)
             self.backbone = _ResNet34(3 + 6 * views, width)
             if head == "pose":
-                self.pose_fc = nn.Linear(8 * width, UPDATE_SIZE)
+                self.pose_fc = _PoseHead(8 * width, UPDATE_SIZE)
             else:
                 self.views_logits_head = nn.Linear(8 * width, 1)
-        if head == "pose":
-            nn.init.zeros_(self.pose_fc.weight)
-            with torch.no_grad():
-                self.pose_fc.bias.copy_(torch.tensor(IDENTITY_UPDATE).roll(-3))
         if weights != "random":
             path = _find(Path(weights), head)
             load_state(self, _read(path, head), path, how_to_get_weights(head))
@@ -99,6 +97,36 @@ class MegaPoseNetwork(nn.Module):
     def save(self, path: str | Path) -> None:
         """Write the weights as a safetensors file, whole or not at all; ``weights`` takes it."""
         save_weights(Path(path), self, "megapose_network", {"head": self.head, "views": self.views})
+
+
+class _PoseHead(nn.Linear):
+    """A linear layer whose parameters are trained in units of its outputs; at first it moves nothing.
+
+    An optimiser that takes steps of one size would else learn pixels slowly and rotations wildly. State dictionaries
+    hold the plain weights; the units are powers of two, so no digit is lost.
+    """
+
+    units: Tensor
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__(inputs, outputs)
+        self.register_buffer("units", torch.tensor(_UNITS), persistent=False)
+        nn.init.zeros_(self.weight)
+        with torch.no_grad():
+            self.bias.copy_(torch.tensor(IDENTITY_UPDATE).roll(-3) / self.units)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return super().forward(x) * self.units
+
+    def _save_to_state_dict(self, destination: Any, prefix: str, keep_vars: bool) -> None:
+        super()._save_to_state_dict(destination, prefix, keep_vars)
+        destination[f"{prefix}weight"] = destination[f"{prefix}weight"] * self.units[:, None]
+        destination[f"{prefix}bias"] = destination[f"{prefix}bias"] * self.units
+
+    def _load_from_state_dict(self, state_dict: Any, prefix: str, *arguments: Any) -> None:
+        units = {f"{prefix}weight": self.units[:, None], f"{prefix}bias": self.units}
+        mine = {name: value / units[name].to(value) for name, value in state_dict.items() if name in units}
+        super()._load_from_state_dict({**state_dict, **mine}, prefix, *arguments)
 
 
 class _Block(nn.Module):

@@ -3,9 +3,10 @@
 import json
 
 import pytest
+from omegaconf import OmegaConf
 
 from ablation.runs import run_once
-from tests.test_config import CONF, SIZES, load
+from tests.test_config import CONF, SIZES, SMALL_MEGAPOSE, load
 from tests.test_config import SMALL as SMALL_NETWORKS
 
 EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
@@ -25,6 +26,7 @@ def small_network(cfg):
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_experiment_runs(name, tiny_bop, tmp_path):
     plain = load("ablate", f"experiment={name}")
+    megapose = "MegaPose" in OmegaConf.to_yaml(plain)
     count = ["num_views=2", "num_inplane=4"] if "num_views" in plain.viewpoints else ["count=8"]
     overrides = [
         f"experiment={name}",
@@ -39,11 +41,12 @@ def test_experiment_runs(name, tiny_bop, tmp_path):
         "projection.num_components=16",
         "trainer.accelerator=cpu",
         *small_network(plain),
+        *(SMALL_MEGAPOSE if megapose else []),
     ]
     record = run_once(load("ablate", *overrides), name)  # overrides that a user makes would end the row
     assert record.status == "finished", record.error
     assert record.row == (name if name.startswith("table") else None)
-    random = "weights" in plain.extractor
+    random = "weights" in plain.extractor or megapose
     assert (record.label is not None) == random
     assert record.figures["targets"] == 1
     estimates = json.loads((next((tmp_path / "runs").iterdir()) / "estimates.json").read_text())
