@@ -6,6 +6,8 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from typing import Protocol
 
+import pandas as pd
+
 from ablation.paper import paper_numbers
 from ablation.records import RunRecord, varied_settings
 from ablation.text_tables import MISSING, Format, text_table
@@ -102,17 +104,16 @@ def memory_table(
             )
         )
         printed[name] = f"{each['printed_mb']} MB"
-    parts = list(dict.fromkeys(part for each in sizes.values() for part in each if part != "total"))
-    share = {part: max(each.get(part, 0) / each["total"] for each in sizes.values()) for part in parts}
-    large = sorted((part for part in parts if share[part] >= _SMALL), key=lambda part: -share[part])
-    small = sorted(part for part in parts if share[part] < _SMALL)
-    titles = ["MiB", *large, *(["others"] if small else []), "total", "printed"]
-    rows = []
-    for name, each in sizes.items():
-        others = [each[part] for part in small if part in each]
-        cells = [each.get(part) for part in large] + ([sum(others) if others else None] if small else [])
-        rows.append([name, *(_mebibytes(size) for size in [*cells, each["total"]]), printed[name]])
-    table = text_table(titles, rows)
+    bytes_ = pd.DataFrame.from_dict(sizes, orient="index", dtype=float)
+    total = bytes_.pop("total")
+    share = bytes_.div(total, axis=0).max()
+    small = sorted(share.index[share < _SMALL])
+    shown = bytes_[share[share >= _SMALL].sort_values(ascending=False, kind="stable").index].copy()
+    if small:
+        shown["others"] = bytes_[small].sum(axis=1, min_count=1)
+    shown["total"] = total
+    cells = shown.map(_mebibytes).assign(printed=printed).reset_index(names="MiB")
+    table = text_table(list(cells.columns), cells.to_numpy().tolist())
     table.caption = "Memory of an object representation"
     table.key = "memory"
     table.remarks.append(
@@ -154,8 +155,8 @@ def _checked(name: str, sizes: Mapping[str, float]) -> dict[str, float]:
     return parts | {"total": total}
 
 
-def _mebibytes(size: float | None) -> str:
-    if size is None:
+def _mebibytes(size: float) -> str:
+    if math.isnan(size):
         return MISSING
     mebibytes = size / _MIB
     if mebibytes >= 100:

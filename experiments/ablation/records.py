@@ -1,13 +1,13 @@
 """What a run of a sweep leaves behind (``run.json``), and all runs as one tidy table."""
 
-import csv
 import json
 import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Self
+
+import pandas as pd
 
 from ablation.paper import find_paper_row
 from foundpose.utils.files import write_atomically, write_json
@@ -116,8 +116,8 @@ def collect_runs(folder: str | Path) -> list[RunRecord]:
     return records
 
 
-def tidy(records: Iterable[RunRecord]) -> list[dict[str, Any]]:
-    """One row per run with the same columns in each: facts, ``settings.*`` and figures; None where a run has none.
+def tidy(records: Iterable[RunRecord]) -> pd.DataFrame:
+    """One row per run: facts, figures and ``settings.*``; None where a run has none.
 
     Values that are lists or mappings become JSON text.
     """
@@ -126,40 +126,31 @@ def tidy(records: Iterable[RunRecord]) -> list[dict[str, Any]]:
         row = {name: getattr(record, name) for name in _FACTS}
         row["folder"] = None if record.folder is None else str(record.folder)
         row |= {f"{_SETTING}{key}": _scalar(value) for key, value in record.settings.items()}
-        row |= {key: _scalar(value) for key, value in record.figures.items()}
-        rows.append(row)
+        rows.append(row | {key: _scalar(value) for key, value in record.figures.items()})
     facts = [*_FACTS, "folder"]
-    others = {key for row in rows for key in row} - set(facts)
     # Figures before settings: there are fewer of them.
-    columns = facts + sorted(others, key=lambda key: (key.startswith(_SETTING), key))
-    return [{column: row.get(column) for column in columns} for row in rows]
+    others = sorted({key for row in rows for key in row} - set(facts), key=lambda k: (k.startswith(_SETTING), k))
+    columns = {name: pd.Series([row.get(name) for row in rows], dtype=object) for name in [*facts, *others]}
+    return pd.DataFrame(columns)
 
 
 def write_tidy(records: Iterable[RunRecord], path: str | Path) -> Path:
-    """Write :func:`tidy` rows as a CSV or parquet file, whole or not at all.
+    """Write :func:`tidy` rows as a CSV file, whole or not at all.
 
-    In CSV, None is an empty field and a truth value is ``true`` or ``false``.
+    None is an empty field and a truth value is ``true`` or ``false``.
 
     Args:
         records: the runs.
-        path: ends in ``.csv`` or ``.parquet``.
+        path: of the file.
 
     Raises:
-        ValueError: another ending, or no runs.
-        ImportError: parquet without pyarrow.
+        ValueError: no runs.
     """
-    path = Path(path)
-    if path.suffix not in (".csv", ".parquet"):
-        raise ValueError(f"the results file must end in .csv or .parquet, got {path.name!r}")
-    rows = tidy(records)
-    if not rows:
+    path, table = Path(path), tidy(records)
+    if table.empty:
         raise ValueError(f"there are no runs to write to {path}")
-    if path.suffix == ".csv":
-        write_atomically(path, lambda temporary: _write_csv(temporary, rows))
-    else:
-        if find_spec("pyarrow") is None:
-            raise ImportError(f"{path.name} needs pyarrow (pip install pyarrow); .csv needs nothing")
-        write_atomically(path, lambda temporary: _write_parquet(temporary, rows))
+    words = table.map(lambda value: str(value).lower() if isinstance(value, bool) else value)
+    write_atomically(path, lambda temporary: words.to_csv(temporary, index=False))
     return path
 
 
@@ -173,27 +164,3 @@ def varied_settings(records: Sequence[RunRecord]) -> list[str]:
 
 def _scalar(value: Any) -> Any:
     return value if value is None or isinstance(value, (str, int, float, bool)) else json.dumps(value)
-
-
-def _write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, fieldnames=list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        for row in rows:
-            writer.writerow({k: str(v).lower() if isinstance(v, bool) else v for k, v in row.items()})
-
-
-def _write_parquet(path: Path, rows: list[dict[str, Any]]) -> None:
-    import pyarrow
-    import pyarrow.parquet
-
-    columns: dict[str, list[Any]] = {}
-    for name in rows[0]:
-        values = [row[name] for row in rows]
-        kinds = {type(value) for value in values if value is not None}
-        if kinds == {int, float}:
-            values = [None if value is None else float(value) for value in values]
-        elif len(kinds) > 1:  # such as a path in one run and a number in another: a column has one type
-            values = [None if value is None else str(value) for value in values]
-        columns[name] = values
-    pyarrow.parquet.write_table(pyarrow.table(columns), path)

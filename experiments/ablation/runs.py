@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
@@ -169,12 +170,9 @@ def _figures(folder: Path) -> dict[str, Any]:
     figures = {name: scores.get(name) for name in ("AR", "AR_VSD", "AR_MSSD", "AR_MSPD", "targets")}
     figures["time_per_image"] = scores.get("average_time_per_image")
     figures |= {f"seconds_per_instance.{k}": v for k, v in timing["seconds_per_instance"].items()}
-    parts: dict[str, list[int]] = defaultdict(list)
-    for sizes in memory.values():
-        for part, size in sizes.items():
-            parts[part].append(size)
-    # Of one object, on average.
-    return figures | {f"memory.{part}": sum(sizes) / len(memory) for part, sizes in parts.items()}
+    # Of one object, on average; a part that an object lacks takes nothing there.
+    mean = pd.DataFrame(memory).fillna(0.0).mean(axis=1)
+    return figures | {f"memory.{part}": float(size) for part, size in mean.items()}
 
 
 def write_reports(folder: str | Path) -> list[RunRecord]:

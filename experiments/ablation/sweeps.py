@@ -1,8 +1,9 @@
 """Tables of sweeps."""
 
-from collections import defaultdict
 from collections.abc import Sequence
 from typing import Any
+
+import pandas as pd
 
 from ablation.records import RunRecord, varied_settings
 from ablation.text_tables import MISSING, Cell, Format, TextTable
@@ -43,19 +44,16 @@ def sweep_table(
     if figures is None:
         counted = [record.figures for record in records if record.counts]
         figures = [name for name in SWEEP_FIGURES if any(each.get(name) is not None for each in counted)]
-    several_datasets = len({record.dataset for record in records}) > 1
-    groups: dict[tuple[Any, ...], list[RunRecord]] = defaultdict(list)
-    for record in records:
-        values = tuple(_show(record.settings.get(key)) for key in keys)
-        groups[(record.dataset, *values) if several_datasets else values].append(record)
-    heads = (["dataset"] if several_datasets else []) + keys
-    titles = heads + [title_of(name) for name in figures]
-    order = sorted(groups, key=lambda values: [_sort_key(value) for value in values])
-    numeric = [all(_is_number(values[i]) for values in order) for i in range(len(heads))]
+    heads = pd.DataFrame({key: [_show(record.settings.get(key)) for record in records] for key in keys})
+    if len({record.dataset for record in records}) > 1:
+        heads.insert(0, "dataset", [record.dataset for record in records])
+    titles = list(heads.columns) + [title_of(name) for name in figures]
+    numeric = [bool(heads[head].map(_is_number).all()) for head in heads.columns]
     text = TextTable(titles, numeric + [True] * len(figures), key="sweep")
-    for values in order:
-        cells = [Cell(value) for value in values]
-        text.rows.append(cells + _cells(groups[values], figures, text))
+    groups = heads.groupby(list(heads.columns), sort=False).indices
+    for values in sorted(groups, key=lambda values: [_sort_key(value) for value in values]):
+        runs = [records[i] for i in groups[values]]
+        text.rows.append([Cell(value) for value in values] + _cells(runs, figures, text))
     return text.render(format)
 
 
@@ -80,11 +78,7 @@ def _show(value: Any) -> str:
 
 
 def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return text == MISSING
-    return True
+    return text == MISSING or not pd.isna(pd.to_numeric(text, errors="coerce"))
 
 
 def _sort_key(text: str) -> tuple[int, float, str]:

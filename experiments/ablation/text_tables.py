@@ -1,9 +1,11 @@
-"""Tables as text: Markdown that reads well unrendered, and LaTeX with booktabs."""
+"""Tables as text, set by pandas: Markdown that reads well unrendered, and LaTeX with booktabs."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
+
+import pandas as pd
 
 Format = Literal["markdown", "latex"]
 Style = Literal["plain", "bold", "underline", "italic"]
@@ -12,31 +14,14 @@ MISSING = "–"
 """What stands in a cell without a value."""
 
 _SUPERSCRIPTS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
-_LATEX = {
-    "\\": r"\textbackslash{}",
-    "{": r"\{",
-    "}": r"\}",
-    "&": r"\&",
-    "%": r"\%",
-    "$": r"\$",
-    "#": r"\#",
-    "_": r"\_",
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-    "<": r"\textless{}",
-    ">": r"\textgreater{}",
-    "|": r"\textbar{}",
-    '"': r"\textquotedbl{}",
-    "–": "--",
-    "−": "$-$",
-    "×": r"$\times$",
-    "✓": r"$\checkmark$",
-    "✗": r"$\times$",
-    "σ": r"$\sigma$",
-    "δ": r"$\delta$",
-    "±": r"$\pm$",
-    "…": r"\ldots{}",
-}
+_COMMANDS = {"bold": "textbf", "underline": "underline", "italic": "textit"}
+_LATEX = str.maketrans(
+    {sign: f"\\{sign}" for sign in "{}&%$#_"}
+    | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+    | {"<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}", '"': r"\textquotedbl{}"}
+    | {"–": "--", "−": "$-$", "×": r"$\times$", "✓": r"$\checkmark$", "✗": r"$\times$"}
+    | {"σ": r"$\sigma$", "δ": r"$\delta$", "±": r"$\pm$", "…": r"\ldots{}"}
+)
 
 
 @dataclass(frozen=True)
@@ -108,6 +93,15 @@ class TextTable:
             return _latex(self)
         raise ValueError(f"format must be markdown or latex, got {format!r}")
 
+    def frame(self, cell: Callable[[Cell], str], heading: Callable[[str], str]) -> pd.DataFrame:
+        """The rows as text, by what sets a cell and what sets a heading."""
+        blank = [""] * len(self.titles)
+        lines = [blank.copy() if isinstance(row, Heading) else [cell(each) for each in row] for row in self.rows]
+        for line, row in zip(lines, self.rows, strict=True):
+            if isinstance(row, Heading):
+                line[self.heading_column] = heading(row.text)
+        return pd.DataFrame(lines, columns=self.titles, dtype=str)
+
 
 def text_table(titles: Sequence[str], rows: Sequence[Sequence[str]], text_columns: int = 1) -> TextTable:
     """A table of plain strings whose first ``text_columns`` columns are flush left and the others right."""
@@ -117,7 +111,7 @@ def text_table(titles: Sequence[str], rows: Sequence[Sequence[str]], text_column
 
 def escape_latex(text: str) -> str:
     """Text that LaTeX sets as it stands here, but for line breaks, which become spaces."""
-    return "".join(_LATEX.get(sign, sign) for sign in re.sub(r"\s+", " ", text))
+    return re.sub(r"\s+", " ", text).translate(_LATEX)
 
 
 def _markdown_text(text: str) -> str:
@@ -133,101 +127,48 @@ def _markdown_cell(cell: Cell) -> str:
 
 
 def _markdown(table: TextTable) -> str:
-    titles = [_markdown_text(title) for title in table.titles]
-    rows = [row if isinstance(row, Heading) else [_markdown_cell(cell) for cell in row] for row in table.rows]
-    cells = [titles] + [row for row in rows if not isinstance(row, Heading)]
-    widths = [max(3, *(len(row[i]) for row in cells)) for i in range(len(titles))]
-
-    def line(row: Sequence[str]) -> str:
-        padded = [
-            text.rjust(width) if numeric else text.ljust(width)
-            for text, width, numeric in zip(row, widths, table.numeric, strict=True)
-        ]
-        return f"| {' | '.join(padded)} |"
-
-    rule = [
-        "-" * (width - 1) + ":" if right else "-" * width
-        for width, right in zip(widths, table.numeric, strict=True)
-    ]
-    lines = [f"**{_markdown_text(table.caption)}**", ""] if table.caption else []
-    lines += [line(titles), line(rule)]
-    for row in rows:
-        if isinstance(row, Heading):
-            # GitHub fills up short rows, so the heading may run across the columns after it.
-            start = "".join(f"| {' ' * width} " for width in widths[: table.heading_column])
-            head = f"{start}| *{_markdown_text(row.text)}*"
-            lines.append(f"{head.ljust(len(lines[-1]) - 2)} |")
-        else:
-            lines.append(line(row))
-    for text in (
-        f"{str(number).translate(_SUPERSCRIPTS)} {note}" for number, note in enumerate(table.notes, 1)
-    ):
-        lines += ["", _markdown_text(text)]
-    for remark in table.remarks:
-        lines += ["", _markdown_text(remark)]
-    return "\n".join(lines) + "\n"
+    body = table.frame(_markdown_cell, lambda text: f"*{_markdown_text(text)}*").to_markdown(
+        index=False,
+        headers=[_markdown_text(title) for title in table.titles],
+        colalign=["right" if numeric else "left" for numeric in table.numeric],
+        disable_numparse=True,  # "12.0" stays "12.0"
+    )
+    notes = [f"{str(number).translate(_SUPERSCRIPTS)} {note}" for number, note in enumerate(table.notes, 1)]
+    below = [_markdown_text(text) for text in [*notes, *table.remarks]]
+    above = [f"**{_markdown_text(table.caption)}**"] if table.caption else []
+    return "\n\n".join([*above, body, *below]) + "\n"
 
 
 def _latex_cell(cell: Cell) -> str:
     text = escape_latex(cell.text)
-    command = {"bold": "textbf", "underline": "underline", "italic": "textit", "plain": None}[cell.style]
-    if command and text:
-        text = f"\\{command}{{{text}}}"
+    if cell.style in _COMMANDS and text:
+        text = f"\\{_COMMANDS[cell.style]}{{{text}}}"
     # Notes hang out to the right, so that numbers stay aligned.
     return text + ("" if cell.note is None else f"\\rlap{{\\textsuperscript{{{cell.note}}}}}")
 
 
 def _latex(table: TextTable) -> str:
-    count = len(table.titles)
-    columns = "".join("r" if right else "l" for right in table.numeric)
-    body: list[list[str] | str] = []
-    for i, row in enumerate(table.rows):
-        if isinstance(row, Heading):
-            span = count - table.heading_column
-            across = f"\\multicolumn{{{span}}}{{l}}{{\\textit{{{escape_latex(row.text)}}}}}"
-            body += ["\\midrule"] if i else []
-            body += [f"{'& ' * table.heading_column}{across} \\\\", "\\midrule"]
-        else:
-            body.append([_latex_cell(cell) for cell in row])
-    # Titles of numbers are centred over them.
-    titles = [
-        f"\\multicolumn{{1}}{{c}}{{{escape_latex(title)}}}" if right else escape_latex(title)
-        for title, right in zip(table.titles, table.numeric, strict=True)
+    span = len(table.titles) - table.heading_column
+    body = table.frame(_latex_cell, lambda text: f"\\multicolumn{{{span}}}{{l}}{{\\textit{{{escape_latex(text)}}}}}")
+    body.columns = [  # titles of numbers are centred over them
+        f"\\multicolumn{{1}}{{c}}{{{escape_latex(title)}}}" if numeric else escape_latex(title)
+        for title, numeric in zip(table.titles, table.numeric, strict=True)
     ]
-    cells = [row for row in body if not isinstance(row, str)]
-    widths = [max([len(row[i]) for row in cells], default=0) for i in range(count)]
-    lines = [
-        "% Needs \\usepackage{booktabs,amssymb}",
-        "\\begin{table}",
-        "  \\centering",
-        "  \\scriptsize",
-        "  \\setlength{\\tabcolsep}{3pt}",
-    ]
+    columns = "".join("r" if numeric else "l" for numeric in table.numeric)
+    text = body.to_latex(index=False, escape=False, column_format=columns)
+    # A heading fills its line, between rules.
+    text = re.sub(r"(?m)^(.*\{l\}\{\\textit\{.*?)[ &]*\\\\$", r"\\midrule\n\1 \\\\\n\\midrule", text)
+    text = text.replace("\\midrule\n\\midrule\n", "\\midrule\n")
+    lines = ["% Needs \\usepackage{booktabs,amssymb}", "\\begin{table}", "\\centering", "\\scriptsize"]
+    lines.append("\\setlength{\\tabcolsep}{3pt}")
     if table.caption:
-        lines.append(f"  \\caption{{{escape_latex(table.caption)}}}")
-        lines.append(f"  \\label{{tab:{table.key}}}")
-    lines += [
-        f"  \\begin{{tabular}}{{{columns}}}",
-        "    \\toprule",
-        f"    {' & '.join(titles)} \\\\",
-        "    \\midrule",
-    ]
-    for entry in body:
-        if isinstance(entry, str):
-            lines.append(f"    {entry}")
-        else:
-            padded = [
-                text.rjust(width) if right else text.ljust(width)
-                for text, width, right in zip(entry, widths, table.numeric, strict=True)
-            ]
-            lines.append(f"    {' & '.join(padded)} \\\\")
-    lines += ["    \\bottomrule", "  \\end{tabular}"]
+        lines += [f"\\caption{{{escape_latex(table.caption)}}}", f"\\label{{tab:{table.key}}}"]
+    lines.append(text.rstrip())
     if table.notes or table.remarks:
-        lines.append("  \\par\\smallskip\\raggedright")
+        lines.append("\\par\\smallskip\\raggedright")
         lines += [
-            f"  \\textsuperscript{{{number}}}~{escape_latex(note)}\\par"
+            f"\\textsuperscript{{{number}}}~{escape_latex(note)}\\par"
             for number, note in enumerate(table.notes, 1)
         ]
-        lines += [f"  {escape_latex(remark)}\\par" for remark in table.remarks]
-    lines.append("\\end{table}")
-    return "\n".join(lines) + "\n"
+        lines += [f"{escape_latex(remark)}\\par" for remark in table.remarks]
+    return "\n".join([*lines, "\\end{table}"]) + "\n"

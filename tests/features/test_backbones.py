@@ -11,6 +11,8 @@ from foundpose.features import Clip, DinoV2, DinoV3, LoftrBackbone, S2DNet, Sam,
 from tests.features.backbones import ALL, CLIP, DINOV3, SAM, TRANSFORMERS, make, shake
 
 CHANNELS = {"loftr": 256, "loftr_fine": 128, "s2dnet": 128, "s2dnet_all": 384}
+# Patches along the side of a picture, of networks whose convolutions in bfloat16 take minutes on some processors.
+SIDES = {"s2dnet": 2, "s2dnet_all": 1}
 
 
 @pytest.fixture
@@ -24,12 +26,14 @@ def test_shapes_and_dtypes(name: str, dtype: torch.dtype, images) -> None:
     extractor = make(name).to(dtype)
     channels = CHANNELS.get(name, 32)
     assert extractor.channels == channels
+    side = SIDES.get(name, 4) if dtype == torch.bfloat16 else 4
+    images = images[..., : 14 * side, : 14 * side]
     with torch.no_grad():
         out = extractor(images.to(dtype))
         empty = extractor(images[:0].to(dtype))
     has_cls = name in ("dinov3", "clip", "clip16")
-    assert out.patches.shape == (3, channels, 4, 4)
-    assert empty.patches.shape == (0, channels, 4, 4)
+    assert out.patches.shape == (3, channels, side, side)
+    assert empty.patches.shape == (0, channels, side, side)
     assert out.patches.dtype == dtype
     assert torch.isfinite(out.patches).all()
     assert (out.cls is not None) == (empty.cls is not None) == has_cls
@@ -113,6 +117,7 @@ def test_image_gradient_equals_finite_differences(name: str, images) -> None:
 @pytest.mark.parametrize("name", ALL)
 def test_bf16_autocast_is_close_and_keeps_the_dtype(name: str, images) -> None:
     exact, fast = make(name), make(name, precision="bf16")
+    images = images[..., : 14 * SIDES.get(name, 4), : 14 * SIDES.get(name, 4)]
     with torch.no_grad():
         out, expected = fast(images), exact(images)
     assert out.patches.dtype == torch.float32

@@ -1,3 +1,4 @@
+import copy
 import math
 from dataclasses import replace
 
@@ -17,7 +18,8 @@ NOISE, D = 0.3, 64
 
 
 def noisy(representation: ObjectRepresentation, amount: float) -> ObjectRepresentation:
-    """The same object with descriptors that are a smooth code of the point, and noise of a known size."""
+    """A copy of the object with descriptors that are a smooth code of the point, and noise of a known size."""
+    representation = copy.deepcopy(representation)
     g = torch.Generator().manual_seed(0)
     points = representation.points_model / representation.info.diameter
     waves = torch.randn(3, D, generator=g)
@@ -26,8 +28,8 @@ def noisy(representation: ObjectRepresentation, amount: float) -> ObjectRepresen
     return representation
 
 
-@pytest.fixture
-def blob_with_noise(oracle_onboarder, blob) -> ObjectRepresentation:
+@pytest.fixture(scope="module")
+def dense_blob(oracle_onboarder, blob) -> ObjectRepresentation:
     dense = Onboarder(
         oracle_onboarder.renderer,
         oracle_onboarder.extractor,
@@ -39,26 +41,26 @@ def blob_with_noise(oracle_onboarder, blob) -> ObjectRepresentation:
     return dense(blob, "blob")
 
 
-def test_true_matches_see_the_same_point(blob_with_noise):
-    pairs = true_matches(blob_with_noise)
+def test_true_matches_see_the_same_point(dense_blob):
+    pairs = true_matches(dense_blob)
     assert len(pairs.first) > 200
-    points = blob_with_noise.points_model
+    points = dense_blob.points_model
     away = torch.linalg.vector_norm(points[pairs.first] - points[pairs.second], dim=1)
     # A patch of this object is about a tenth of its diameter wide.
-    assert away.max() < 0.03 * blob_with_noise.info.diameter
-    of = torch.bucketize(pairs.first, blob_with_noise.template_offsets, right=True)
-    assert (of != torch.bucketize(pairs.second, blob_with_noise.template_offsets, right=True)).all()
+    assert away.max() < 0.03 * dense_blob.info.diameter
+    of = torch.bucketize(pairs.first, dense_blob.template_offsets, right=True)
+    assert (of != torch.bucketize(pairs.second, dense_blob.template_offsets, right=True)).all()
 
 
-def test_scales_of_a_case_with_a_known_answer(blob_with_noise):
-    clean = measure_scales(noisy(blob_with_noise, 0.0))
-    scales = measure_scales(noisy(blob_with_noise, NOISE * 5.0))
+def test_scales_of_a_case_with_a_known_answer(dense_blob):
+    clean = measure_scales(noisy(dense_blob, 0.0))
+    scales = measure_scales(noisy(dense_blob, NOISE * 5.0))
     sigma = math.sqrt(2.0) * NOISE * 5.0  # of the difference of two patches
     # What the code itself changes between neighbouring points comes on top.
     assert clean.channel < 0.15 * sigma
     assert scales.channel == pytest.approx(sigma, rel=0.05)
     assert scales.match == pytest.approx(sigma * math.sqrt(D), rel=0.05)
-    doubled = noisy(blob_with_noise, NOISE * 5.0)
+    doubled = noisy(dense_blob, NOISE * 5.0)
     doubled.descriptors = 2.0 * doubled.descriptors
     doubled.words = 2.0 * doubled.words
     twice = measure_scales(doubled)

@@ -2,6 +2,7 @@ import csv
 import json
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 from ablation import RunRecord, collect_runs, tidy, varied_settings, write_tidy
@@ -86,10 +87,9 @@ def test_bad_facts_are_refused(facts: dict, message: str) -> None:
 
 
 def test_tidy_has_every_setting_and_figure_in_every_row() -> None:
-    rows = tidy(_some())
-    columns = list(rows[0])
-    assert all(list(row) == columns for row in rows)
-    assert columns == [
+    table = tidy(_some())
+    rows = table.to_dict("records")
+    assert list(table.columns) == [
         *("name", "row", "dataset", "status", "error", "label", "folder"),
         *("AR", "AR_MSPD", "memory.total"),
         *("settings.ids", "settings.pca", "settings.seed", "settings.words.num_words"),
@@ -117,35 +117,18 @@ def test_a_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.
     path = write_tidy(_some()[:1], tmp_path / "results.csv")
     before = path.read_bytes()
 
-    def interrupted(self: csv.DictWriter, row: dict) -> None:
+    def interrupted(self: pd.DataFrame, file: Path, **_: object) -> None:
+        file.write_text("half a")
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(csv.DictWriter, "writerow", interrupted)
+    monkeypatch.setattr(pd.DataFrame, "to_csv", interrupted)
     with pytest.raises(KeyboardInterrupt):
         write_tidy(_some(), path)
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_parquet(tmp_path: Path) -> None:
-    parquet = pytest.importorskip("pyarrow.parquet", reason="parquet needs pyarrow, which is not installed")
-    path = write_tidy(_some(), tmp_path / "results.parquet")
-    rows = parquet.read_table(path).to_pylist()
-    assert [row["settings.words.num_words"] for row in rows] == ["1024", "2048", "x"]
-    assert [row["AR_MSPD"] for row in rows] == [0.1 + 0.2, None, 1.0]
-    assert [row["settings.pca"] for row in rows] == [None, True, None]
-
-
-def test_parquet_without_pyarrow_says_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ablation.records.find_spec", lambda name: None)
-    with pytest.raises(ImportError, match="pip install pyarrow"):
-        write_tidy(_some(), tmp_path / "results.parquet")
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_bad_results_files_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"\.csv or \.parquet, got 'results.xlsx'"):
-        write_tidy(_some(), tmp_path / "results.xlsx")
+def test_no_runs_are_no_table(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="no runs"):
         write_tidy([], tmp_path / "results.csv")
 

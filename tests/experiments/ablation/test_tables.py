@@ -126,7 +126,7 @@ def check_markdown(text: str) -> None:
     assert len({len(line) for line in lines}) == 1
     counts = [len(re.findall(r"(?<!\\)\|", line)) for line in lines]
     assert max(counts) == counts[0] == counts[1]
-    assert re.fullmatch(r"\|( -+:? \|)+", lines[1])
+    assert re.fullmatch(r"\|(:?-+:?\|)+", lines[1])
 
 
 def check_latex(text: str) -> None:
