@@ -8,7 +8,6 @@ python experiments/scaling.py counts=[10,100] storages=[int8,pq64]
 """
 
 import copy
-import ctypes
 import gc
 import os
 import shutil
@@ -21,6 +20,8 @@ from pathlib import Path
 from typing import cast
 
 import hydra
+import pandas as pd
+import psutil
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
@@ -32,6 +33,7 @@ from tqdm import tqdm
 
 from benchmarking import ScriptedExtractor, Workload, WorkloadSizes, make_workload
 from benchmarking.hardware import describe_hardware, describe_versions
+from benchmarking.measure import return_free_memory
 from foundpose import FoundPose
 from foundpose.config import clear_errors
 from foundpose.representation import ObjectRepresentation
@@ -40,7 +42,6 @@ from foundpose.utils.files import write_atomically, write_json, write_text
 
 _MIB = 2**20
 _GIB = 2**30
-_STATUS = Path("/proc/self/status")
 _CROPS_PREPARED = 8
 
 
@@ -153,8 +154,8 @@ def measure(cfg: DictConfig, files: Path) -> list[Row]:
     counts = sorted(cfg.counts)
     if not counts or counts[0] < 1 or cfg.crops < 1:
         raise ValueError(f"counts and crops must be at least 1, got {list(cfg.counts)} and {cfg.crops}")
-    if not _STATUS.is_file():
-        raise ValueError(f"resident memory is read from {_STATUS}, which this system does not have")
+    if not psutil.LINUX:
+        raise ValueError("the memory of mapped files is told by Linux only")
     cfg = prepared(cfg)
     workload = make_workload(_sizes(cfg))
     crops = PreparedCrops(cfg, workload)
@@ -215,6 +216,7 @@ def distinct_files(
 def measure_objects(name: str, paths: Sequence[Path], crops: PreparedCrops, count: int) -> Row:
     """Open files and estimate poses of crops of random objects among them, twice."""
     forget(paths)
+    gc.collect()
     return_free_memory()
     before = resident()
     start = time.perf_counter()
@@ -237,14 +239,6 @@ def measure_objects(name: str, paths: Sequence[Path], crops: PreparedCrops, coun
     )
 
 
-def return_free_memory() -> None:
-    """Give memory that is not used any more back to the system now, not while something is measured."""
-    gc.collect()
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc's
-    if trim is not None:
-        trim(0)
-
-
 def forget(paths: Sequence[Path]) -> None:
     """Have the system drop files from its page cache, so that they are read from the disk."""
     for path in paths:
@@ -258,23 +252,25 @@ def resident() -> float:
 
     Objects are nothing else; the rest of the memory comes and goes with what was computed before.
     """
-    lines = dict(line.split(":", 1) for line in _STATUS.read_text().splitlines())
-    return 1024.0 * int(lines["RssFile"].split()[0])
+    return float(psutil.Process().memory_info().shared)
 
 
 def table(rows: Sequence[Row]) -> str:
     """Markdown; extrapolated rows are marked with ≈."""
-    lines = [
-        "| storage | objects | disk, GiB | open, s | resident, MiB: open | after crops | ms/crop: first | again |",
-        "|---|---|---|---|---|---|---|---|",
+    cells = [
+        {
+            "storage": row.storage,
+            "objects": f"{'' if row.measured else '≈ '}{row.objects}",
+            "disk, GiB": f"{row.disk / _GIB:.3g}",
+            "open, s": f"{row.open_seconds:.2g}",
+            "resident, MiB: open": f"{row.resident_open / _MIB:.3g}",
+            "after crops": f"{row.resident_used / _MIB:.3g}",
+            "ms/crop: first": f"{1e3 * row.first:.3g}",
+            "again": f"{1e3 * row.again:.3g}",
+        }
+        for row in rows
     ]
-    for row in rows:
-        lines.append(
-            f"| {row.storage} | {'' if row.measured else '≈ '}{row.objects} | {row.disk / _GIB:.3g} | "
-            f"{row.open_seconds:.2g} | {row.resident_open / _MIB:.3g} | {row.resident_used / _MIB:.3g} | "
-            f"{1e3 * row.first:.3g} | {1e3 * row.again:.3g} |"
-        )
-    return "\n".join(lines) + "\n"
+    return pd.DataFrame(cells).to_markdown(index=False, disable_numparse=True) + "\n"
 
 
 def plot(rows: Sequence[Row]) -> Figure:

@@ -129,7 +129,9 @@ def tidy(records: Iterable[RunRecord]) -> pd.DataFrame:
         rows.append(row | {key: _scalar(value) for key, value in record.figures.items()})
     facts = [*_FACTS, "folder"]
     # Figures before settings: there are fewer of them.
-    others = sorted({key for row in rows for key in row} - set(facts), key=lambda k: (k.startswith(_SETTING), k))
+    others = sorted(
+        {key for row in rows for key in row} - set(facts), key=lambda k: (k.startswith(_SETTING), k)
+    )
     columns = {name: pd.Series([row.get(name) for row in rows], dtype=object) for name in [*facts, *others]}
     return pd.DataFrame(columns)
 

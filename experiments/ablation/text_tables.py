@@ -96,7 +96,9 @@ class TextTable:
     def frame(self, cell: Callable[[Cell], str], heading: Callable[[str], str]) -> pd.DataFrame:
         """The rows as text, by what sets a cell and what sets a heading."""
         blank = [""] * len(self.titles)
-        lines = [blank.copy() if isinstance(row, Heading) else [cell(each) for each in row] for row in self.rows]
+        lines = [
+            blank.copy() if isinstance(row, Heading) else [cell(each) for each in row] for row in self.rows
+        ]
         for line, row in zip(lines, self.rows, strict=True):
             if isinstance(row, Heading):
                 line[self.heading_column] = heading(row.text)
@@ -149,7 +151,9 @@ def _latex_cell(cell: Cell) -> str:
 
 def _latex(table: TextTable) -> str:
     span = len(table.titles) - table.heading_column
-    body = table.frame(_latex_cell, lambda text: f"\\multicolumn{{{span}}}{{l}}{{\\textit{{{escape_latex(text)}}}}}")
+    body = table.frame(
+        _latex_cell, lambda text: f"\\multicolumn{{{span}}}{{l}}{{\\textit{{{escape_latex(text)}}}}}"
+    )
     body.columns = [  # titles of numbers are centred over them
         f"\\multicolumn{{1}}{{c}}{{{escape_latex(title)}}}" if numeric else escape_latex(title)
         for title, numeric in zip(table.titles, table.numeric, strict=True)

@@ -1,14 +1,14 @@
 """What a benchmark ran on."""
 
-import importlib.util
-import os
 import platform
 import re
 import subprocess
+from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+import psutil
 import torch
 
 _PACKAGES = (
@@ -22,12 +22,12 @@ def describe_hardware(device: torch.device) -> dict[str, Any]:
     facts: dict[str, Any] = {
         "platform": platform.platform(),
         "cpu": cpu_model(),
-        "cores": os.cpu_count(),
-        "cores_available": _available_cores(),
+        "cores": psutil.cpu_count(),
+        "cores_available": len(psutil.Process().cpu_affinity()) if psutil.LINUX else psutil.cpu_count(),
         "threads": torch.get_num_threads(),
         "cpu_capability": torch.backends.cpu.get_cpu_capability(),
-        "load_average": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
-        "ram_bytes": _ram_bytes(),
+        "load_average": psutil.getloadavg()[0],
+        "ram_bytes": psutil.virtual_memory().total,
         "device": str(device),
         "gpu": None,
     }
@@ -70,27 +70,9 @@ def git_commit(folder: Path) -> str | None:
     return found.stdout.strip() or None
 
 
-def is_installed(module: str) -> bool:
-    """Whether a module can be imported, without doing so."""
-    return importlib.util.find_spec(module) is not None
-
-
 def cpu_model() -> str:
-    """The processor's name."""
-    try:
+    """The processor's name, which Linux tells in a file and other systems through Python."""
+    found = None
+    with suppress(OSError):
         found = re.search(r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
-    except OSError:
-        found = None
     return found[1].strip() if found else platform.processor() or platform.machine()
-
-
-def _available_cores() -> int | None:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-
-
-def _ram_bytes() -> int | None:
-    try:
-        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, ValueError, OSError):
-        return None

@@ -1,7 +1,6 @@
 """Time and memory of a call."""
 
 import ctypes
-import re
 import time
 import warnings
 from collections.abc import Callable, Sequence
@@ -10,9 +9,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import psutil
 import torch
 
-_STATUS = Path("/proc/self/status")
 _RESET_PEAK = Path("/proc/self/clear_refs")
 
 
@@ -105,9 +104,9 @@ class PeakMemory:
             self._before = torch.cuda.memory_allocated(self.device)
         elif self.device.type == "cpu":
             try:
-                _return_free_memory()
+                return_free_memory()
                 _RESET_PEAK.write_text("5")
-                self._before = _status_bytes("VmRSS")
+                self._before = psutil.Process().memory_info().rss
             except OSError as error:
                 self.memory = Memory(None, None, f"the peak resident size cannot be reset here ({error})")
         return self
@@ -119,7 +118,7 @@ class PeakMemory:
             torch.cuda.synchronize(self.device)
             peak = torch.cuda.max_memory_allocated(self.device)
         else:
-            peak = _status_bytes("VmHWM")
+            peak = _peak_resident()
         self.memory = Memory(max(peak - self._before, 0), peak)
 
 
@@ -194,16 +193,15 @@ def synchronize(device: torch.device) -> None:
         torch.mps.synchronize()
 
 
-def _return_free_memory() -> None:
+def return_free_memory() -> None:
     """Have glibc's allocator give back what it does not use; other allocators are left alone."""
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim is not None:
         trim(0)
 
 
-def _status_bytes(name: str) -> int:
-    """A size of this process from Linux's ``/proc/self/status``."""
-    found = re.search(rf"^{name}:\s*(\d+) kB", _STATUS.read_text(), re.MULTILINE)
-    if found is None:
-        raise OSError(f"{_STATUS} has no {name}")
-    return 1024 * int(found[1])
+def _peak_resident() -> int:
+    """Largest resident size since the peak was reset, which Linux counts in KiB."""
+    import resource  # not on every system; where it is missing the peak cannot be reset either
+
+    return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

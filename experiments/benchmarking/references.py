@@ -3,8 +3,11 @@
 Each comparison says how much faster ours is and how far the results agree, so that the speed means something.
 """
 
+import logging
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -12,21 +15,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from benchmarking.hardware import is_installed
 from benchmarking.inference import Stages, pnp_name, stage_inputs
 from benchmarking.measure import MeasureSettings, measure
-from benchmarking.numpy_method import match_by_template, retrieve_by_template
 from benchmarking.workload import Workload
-from foundpose.geometry import pose_deviation
 from foundpose.onboarding import Progress
-from foundpose.pnp import LevenbergMarquardtPnp, RansacPnp
-from foundpose.refinement import FeaturemetricRefiner, Observation, PoseProposals
-from foundpose.refinement.refiners import alignment_problem
-from foundpose.representation import ObjectRepresentation
-from foundpose.retrieval import SpatialReranker, TemplateRetriever, VisualWords
+from foundpose.retrieval import VisualWords
 
 Array = NDArray[Any]
-Result = Any
+_ROWS = 8192
 
 
 @dataclass(frozen=True)
@@ -43,9 +39,9 @@ class Reference:
     """
 
     name: str
-    ours: Callable[[], Result]
-    reference: Callable[[], Result]
-    agreement: Callable[[Result, Result], dict[str, float]]
+    ours: Callable[[], Any]
+    reference: Callable[[], Any]
+    agreement: Callable[[Any, Any], dict[str, float]]
     once: bool = False
     unavailable: str | None = None
 
@@ -87,68 +83,73 @@ def run_references(
 
 
 def _compare(each: Reference, device: torch.device, settings: MeasureSettings) -> Comparison:
+    last: dict[str, Any] = {}
+    seconds = {}
     how = settings.once() if each.once else settings
-    last: dict[str, Result] = {}
-
-    def keep(name: str, call: Callable[[], Result]) -> Callable[[], None]:
-        def run() -> None:
-            last[name] = call()
-
-        return run
-
+    calls = {"ours": (each.ours, device), "reference": (each.reference, torch.device("cpu"))}
     with torch.inference_mode():
-        ours = measure(keep("ours", each.ours), device, how).median
-        theirs = measure(keep("reference", each.reference), torch.device("cpu"), how).median
+        for name, (call, where) in calls.items():
+            seconds[name] = measure(lambda n=name, c=call: last.update({n: c()}), where, how).median  # type: ignore[misc]
         agreement = each.agreement(last["ours"], last["reference"])
-    return Comparison(each.name, ours, theirs, theirs / ours, agreement)
-
-
-def inference_references(stages: Stages, workload: Workload) -> list[Reference]:
-    """References of retrieval, matching, RANSAC, polish and refinement."""
-    inputs, coarse = stage_inputs(stages, workload)
-    representation = workload.representation
-    references: list[Reference] = []
-    retriever = stages.retriever
-    if isinstance(retriever, SpatialReranker):
-        retriever = retriever.retriever
-    if isinstance(retriever, TemplateRetriever) and retriever.bow.sigma != "auto":
-        query = coarse.query
-        arrays = (_numpy(query.descriptors), _numpy(query.valid), *_index_arrays(representation))
-        bow, sigma, num_templates = retriever.bow, retriever.bow.sigma, retriever.num_templates
-        references.append(
-            Reference(
-                "retrieval: NumPy, template by template",
-                lambda: retriever(*inputs["retriever"]).index,
-                lambda: retrieve_by_template(
-                    *arrays,
-                    sigma=sigma,
-                    num_nearest=bow.num_nearest,
-                    num_templates=num_templates,
-                    root=bow.normalization == "hellinger",
-                ),
-                _same_indices("same_top"),
-            )
-        )
-    arguments = [_numpy(x) for x in inputs["matcher"][:4]]
-    references.append(
-        Reference(
-            "matching: NumPy, template by template",
-            lambda: stages.matcher(*inputs["matcher"]).template_patch,
-            lambda: match_by_template(*arguments),
-            _same_indices("same_matches", inputs["matcher"][1]),
-        )
+    return Comparison(
+        each.name, **seconds, times_faster=seconds["reference"] / seconds["ours"], agreement=agreement
     )
-    references += _pnp_references(stages, stages.pnp, inputs["pnp"], coarse.templates.index.shape[1])
-    references.append(_polish_reference(stages.pnp, inputs["pnp"]))
-    if isinstance(stages.refiner, FeaturemetricRefiner):
-        references.append(_refinement_reference(stages.refiner, *inputs["refiner"]))
-    return references
+
+
+def ransac_references(stages: Stages, workload: Workload) -> list[Reference]:
+    """OpenCV's RANSAC, one problem after the other, with both of its minimal solvers."""
+    inputs, coarse = stage_inputs(stages, workload, refine_all=False)
+    arguments, h = inputs["pnp"], coarse.templates.index.shape[1]
+    points_image, points_model, K, valid = (_numpy(x) for x in arguments[:4])
+    problems = [
+        (x[mask].astype(np.float64), u[mask].astype(np.float64), k.astype(np.float64))
+        for u, x, k, mask in zip(points_image, points_model, K, valid, strict=True)
+    ]
+    pnp = stages.pnp
+    confidence = 0.9999 if pnp.confidence is None else pnp.confidence
+
+    def opencv(solver: str) -> Tensor:
+        import cv2
+
+        flag = {"p3p": cv2.SOLVEPNP_P3P, "epnp": cv2.SOLVEPNP_EPNP}[solver]
+        poses = torch.full((len(problems), 4, 4), torch.nan, dtype=torch.float64)
+        for i, (x, u, k) in enumerate(problems):
+            if len(x) < 4:
+                continue
+            ok, rotation, t, _ = cv2.solvePnPRansac(
+                *(x, u, k, None),
+                iterationsCount=len(pnp.draws),
+                reprojectionError=pnp.threshold,
+                confidence=confidence,
+                flags=flag,
+            )
+            if ok:
+                poses[i] = torch.eye(4, dtype=torch.float64)
+                poses[i, :3] = torch.from_numpy(np.hstack([cv2.Rodrigues(rotation)[0], t]))
+        return poses
+
+    def agreement(ours: Tensor, theirs: Tensor) -> dict[str, float]:
+        figures = {}
+        for name, poses in (("ours", ours.double().cpu()), ("reference", theirs)):
+            counts = _inliers(poses, problems, pnp.threshold)
+            figures[f"mean_inliers_{name}"] = float(counts.mean())
+            figures[f"best_of_each_{name}"] = float(counts.reshape(-1, h).max(1).mean())
+        return figures
+
+    return [
+        Reference(
+            f"{pnp_name(h)}: OpenCV's RANSAC with {solver}, ours with {mine.solver}",
+            lambda mine=mine: mine(*arguments).T_camera_from_model,  # type: ignore[misc]
+            lambda solver=solver: opencv(solver),  # type: ignore[misc]
+            agreement,
+            unavailable=None if is_installed("cv2") else _how_to_install("OpenCV"),
+        )
+        for solver, mine in (("p3p", pnp), ("epnp", stages.epnp or pnp))
+    ]
 
 
 def kmeans_reference(descriptors: Tensor, words: VisualWords, iterations: int) -> Reference:
     """Visual words by faiss, or where it is missing by scikit-learn."""
-    from benchmarking.clustering import faiss_kmeans, inertia, sklearn_kmeans
-
     fast = is_installed("faiss")
     points = np.ascontiguousarray(_numpy(descriptors.float()))
     other = faiss_kmeans if fast else sklearn_kmeans
@@ -168,65 +169,47 @@ def kmeans_reference(descriptors: Tensor, words: VisualWords, iterations: int) -
     )
 
 
-def _pnp_references(stages: Stages, pnp: RansacPnp, arguments: list[Any], h: int) -> list[Reference]:
-    """OpenCV's RANSAC, one problem after the other."""
-    points_image, points_model, K, valid = (_numpy(x) for x in arguments[:4])
-    problems = [
-        (x[mask].astype(np.float64), u[mask].astype(np.float64), k.astype(np.float64))
-        for u, x, k, mask in zip(points_image, points_model, K, valid, strict=True)
-    ]
-    iterations = len(pnp.draws)
-    confidence = 0.9999 if pnp.confidence is None else pnp.confidence
+def faiss_kmeans(points: NDArray[np.float32], clusters: int, iterations: int) -> NDArray[np.float32]:
+    """Centroids (k, d) by faiss, of all points (it samples them by default)."""
+    # It tells how it looked for its own libraries.
+    logging.getLogger("faiss").setLevel(logging.WARNING)
+    import faiss
 
-    def opencv(solver: str) -> Callable[[], Tensor]:
-        def run() -> Tensor:
-            import cv2
-
-            flag = {"p3p": cv2.SOLVEPNP_P3P, "epnp": cv2.SOLVEPNP_EPNP}[solver]
-            poses = torch.full((len(problems), 4, 4), torch.nan, dtype=torch.float64)
-            for i, (x, u, k) in enumerate(problems):
-                if len(x) < 4:
-                    continue
-                ok, rotation, t, _ = cv2.solvePnPRansac(
-                    *(x, u, k, None),
-                    iterationsCount=iterations,
-                    reprojectionError=pnp.threshold,
-                    confidence=confidence,
-                    flags=flag,
-                )
-                if ok:
-                    T = np.eye(4)
-                    T[:3, :3], T[:3, 3] = cv2.Rodrigues(rotation)[0], t[:, 0]
-                    poses[i] = torch.from_numpy(T)
-            return poses
-
-        return run
-
-    def agreement(ours: Tensor, theirs: Tensor) -> dict[str, float]:
-        mine = _inliers(ours.double().cpu(), problems, pnp.threshold)
-        other = _inliers(theirs, problems, pnp.threshold)
-        return {
-            "mean_inliers_ours": float(mine.mean()),
-            "mean_inliers_reference": float(other.mean()),
-            "best_of_each_ours": float(mine.reshape(-1, h).max(1).mean()),
-            "best_of_each_reference": float(other.reshape(-1, h).max(1).mean()),
-        }
-
-    unavailable = None if is_installed("cv2") else _how_to_install("OpenCV")
-    choices = [("p3p", pnp), ("epnp", stages.epnp or pnp)]
-    return [
-        Reference(
-            f"{pnp_name(h)}: OpenCV's RANSAC with {solver}, ours with {mine.solver}",
-            lambda mine=mine: mine(*arguments).T_camera_from_model,  # type: ignore[misc]
-            opencv(solver),
-            agreement,
-            unavailable=unavailable,
-        )
-        for solver, mine in choices
-    ]
+    size = len(points)
+    kmeans = faiss.Kmeans(points.shape[1], clusters, niter=iterations, seed=0, max_points_per_centroid=size)
+    kmeans.train(points)
+    return np.asarray(kmeans.centroids)
 
 
-def _inliers(T: Tensor, problems: Sequence[tuple[Any, Any, Any]], threshold: float) -> NDArray[np.float64]:
+def sklearn_kmeans(points: NDArray[np.float32], clusters: int, iterations: int) -> NDArray[np.float32]:
+    """Centroids (k, d) by scikit-learn."""
+    from sklearn.cluster import KMeans
+    from sklearn.exceptions import ConvergenceWarning
+
+    with warnings.catch_warnings():
+        # That the iterations do not suffice is what they are there to say.
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        kmeans = KMeans(clusters, n_init=1, max_iter=iterations, tol=0.0, random_state=0).fit(points)
+    return np.asarray(kmeans.cluster_centers_, dtype=np.float32)
+
+
+def inertia(points: Tensor, centroids: Tensor) -> float:
+    """Sum of squared distances of points (N, d) to the nearest of the centroids (k, d), from differences."""
+    total = torch.zeros((), dtype=torch.float64)
+    for block in points.split(_ROWS):
+        nearest = torch.cdist(block, centroids).argmin(dim=1)
+        total += (block - centroids[nearest]).double().square().sum().cpu()
+    return float(total)
+
+
+def is_installed(module: str) -> bool:
+    """Whether a module can be imported, without doing so."""
+    return find_spec(module) is not None
+
+
+def _inliers(
+    T: Tensor, problems: Sequence[tuple[Array, Array, Array]], threshold: float
+) -> NDArray[np.float64]:
     """Number of points that poses (P, 4, 4) project within the threshold; 0 for no pose."""
     counts = np.zeros(len(problems))
     for i, ((x, u, k), pose) in enumerate(zip(problems, T.numpy(), strict=True)):
@@ -235,76 +218,6 @@ def _inliers(T: Tensor, problems: Sequence[tuple[Any, Any, Any]], threshold: flo
             error = np.linalg.norm(y[:, :2] / y[:, 2:] - u, axis=1)
         counts[i] = ((error <= threshold) & (y[:, 2] > 0)).sum()
     return counts
-
-
-def _polish_reference(pnp: RansacPnp, arguments: list[Any]) -> Reference:
-    """One least-squares pose on the inliers of the first problem, from a pose a little off."""
-    from benchmarking.least_squares import pnp_least_squares, turned
-
-    found = pnp(*arguments)
-    points_image, points_model, K = (x[:1] for x in arguments[:3])
-    weights = found.inliers[:1].to(K.dtype)
-    start = turned(found.T_camera_from_model[:1], points_model[0], degrees=1.0)
-    optimiser = LevenbergMarquardtPnp(max_iterations=30)
-    chosen = _numpy(found.inliers[0])
-    x, u, k = (_numpy(t[0]).astype(np.float64) for t in (points_model, points_image, K))
-    T = _numpy(start[0]).astype(np.float64)
-    return Reference(
-        "polish of 1 pose: scipy.optimize.least_squares",
-        lambda: optimiser(start, points_image, points_model, K, weights).T_camera_from_model[0],
-        lambda: pnp_least_squares(T, x[chosen], u[chosen], k),
-        _pose_agreement,
-    )
-
-
-def _refinement_reference(
-    refiner: FeaturemetricRefiner, proposals: PoseProposals, observation: Observation
-) -> Reference:
-    """One featuremetric refinement: the first crop's."""
-    from benchmarking.least_squares import UNSUPPORTED, featuremetric_least_squares, is_supported
-
-    alignment, one = refiner.alignment, alignment_problem(proposals, observation).take(slice(1))
-    start = proposals.T_crop_from_model[0, :1]
-
-    def agreement(ours: Tensor, theirs: Tensor) -> dict[str, float]:
-        both = torch.stack([ours, theirs.to(ours)])
-        costs = [alignment(T[None], one).initial_cost.item() for T in (start[0], *both)]
-        return _pose_agreement(ours, theirs) | {
-            "cost_before": costs[0],
-            "cost_ours": costs[1],
-            "cost_reference": costs[2],
-        }
-
-    return Reference(
-        "refinement of 1 hypothesis: scipy.optimize.least_squares",
-        lambda: alignment(start, one).T_crop_from_model[0],
-        lambda: featuremetric_least_squares(start[0], one, alignment),
-        agreement,
-        unavailable=None if is_supported(alignment) else UNSUPPORTED,
-    )
-
-
-def _same_indices(name: str, valid: Tensor | None = None) -> Callable[[Tensor, Any], dict[str, float]]:
-    """Share of equal indices; of the patches that are valid, for matches (B, h, P)."""
-
-    def agreement(ours: Tensor, theirs: NDArray[np.int64]) -> dict[str, float]:
-        same = _numpy(ours) == theirs
-        if valid is not None:
-            same = same[np.broadcast_to(_numpy(valid)[:, None], same.shape)]
-        return {name: float(same.mean())}
-
-    return agreement
-
-
-def _pose_agreement(ours: Tensor, theirs: Tensor) -> dict[str, float]:
-    """Turn between two poses in degrees, and their distance as a share of the distance from the camera."""
-    a, b = ours.double().cpu(), theirs.double().cpu()
-    apart = pose_deviation(a, b, unit=b[:3, 3].norm())
-    return {"degrees_apart": float(apart.rotation), "distance_apart": float(apart.translation)}
-
-
-def _index_arrays(representation: ObjectRepresentation) -> tuple[Array, Array, Array]:
-    return _numpy(representation.words), _numpy(representation.idf), _numpy(representation.template_bow)
 
 
 def _how_to_install(what: str) -> str:

@@ -25,7 +25,7 @@ from benchmarking.inference import (
 )
 from benchmarking.measure import MeasureSettings
 from benchmarking.onboarding import OnboardingJob, onboarding_tasks, projected_descriptors, raw_descriptors
-from benchmarking.references import inference_references, kmeans_reference, run_references
+from benchmarking.references import kmeans_reference, ransac_references, run_references
 from benchmarking.report import BenchmarkResult
 from benchmarking.sizes import WorkloadSizes
 from benchmarking.tasks import run_tasks
@@ -85,7 +85,7 @@ def run_benchmark(cfg: DictConfig, folder: Path, progress: Progress) -> Benchmar
     if "onboarding" in cfg.groups:
         _measure_onboarding(cfg, method, workload, folder, settings, result, progress)
     if "references" in cfg.groups:
-        references = inference_references(stages, workload)
+        references = ransac_references(stages, workload)
         if cfg.references.kmeans:
             descriptors = projected_descriptors(workload)
             references.append(

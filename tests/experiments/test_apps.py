@@ -200,9 +200,7 @@ def left_alone(tiny_bop, tmp_path_factory):
     """A folder with the onboarded objects, and in ``run`` what nobody interrupted."""
     folder = tmp_path_factory.mktemp("alone")
     with pytest.MonkeyPatch.context() as monkeypatch:
-        run_app(
-            monkeypatch, "estimate", *bop_arguments(tiny_bop, folder), f"hydra.run.dir={folder / 'run'}"
-        )
+        run_app(monkeypatch, "estimate", *bop_arguments(tiny_bop, folder), f"hydra.run.dir={folder / 'run'}")
     return folder
 
 

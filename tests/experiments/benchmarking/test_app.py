@@ -47,7 +47,7 @@ def test_everything_small(monkeypatch, tmp_path, capsys):
         *("save", "load"),
     ]
     assert onboarding["rendering"]["projected"] == pytest.approx(40 * onboarding["rendering"]["per_unit"])
-    assert len(content["references"]) == 7
+    assert len(content["references"]) == 3
     assert [curve["name"] for curve in content["curves"]] == ["batch", "ransac_iterations", "lm_iterations"]
     assert content["settings"]["sizes"]["templates"] == 40
     assert content["hardware"]["cpu"]

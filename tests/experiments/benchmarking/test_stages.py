@@ -11,9 +11,7 @@ from hydra import compose, initialize_config_dir
 from torch import nn
 
 from benchmarking import MeasureSettings, WorkloadSizes, make_workload, with_crops
-from benchmarking.clustering import faiss_kmeans, inertia, sklearn_kmeans
 from benchmarking.curves import measure_curves
-from benchmarking.hardware import is_installed
 from benchmarking.inference import (
     COARSE,
     REFINE_ONE,
@@ -23,19 +21,35 @@ from benchmarking.inference import (
     estimate,
     pipeline_tasks,
     record_calls,
+    stage_inputs,
     stage_tasks,
 )
-from benchmarking.least_squares import featuremetric_least_squares, is_supported, turned
-from benchmarking.references import Reference, inference_references, kmeans_reference, run_references
+from benchmarking.references import (
+    Reference,
+    faiss_kmeans,
+    inertia,
+    is_installed,
+    kmeans_reference,
+    ransac_references,
+    run_references,
+    sklearn_kmeans,
+)
 from benchmarking.run import make_stages
 from benchmarking.scripted import ScriptedExtractor
 from foundpose.features import PatchExtractor, PatchFeatures
-from foundpose.geometry import rotation_angle
+from foundpose.geometry import pose_deviation, rotation_angle
 from foundpose.optimization import BarronLoss, Huber
-from foundpose.pnp import PnpResult
+from foundpose.pnp import LevenbergMarquardtPnp, PnpResult
 from foundpose.refinement import FeaturemetricAlignment
 from foundpose.refinement.refiners import alignment_problem
 from foundpose.retrieval import VisualWords
+from tests.experiments.benchmarking.least_squares import (
+    featuremetric_least_squares,
+    is_supported,
+    pnp_least_squares,
+    turned,
+)
+from tests.experiments.benchmarking.numpy_method import match_by_template, retrieve_by_template
 
 CONF = Path(__file__).resolve().parents[3] / "conf"
 CPU = torch.device("cpu")
@@ -176,32 +190,57 @@ def test_calls_with_keywords_are_refused():
         record_calls({"it": module}, lambda: module(input=1))
 
 
-def test_references_agree_with_ours(stages, workload):
-    comparisons = {
-        each.name.split(":")[0] + each.name.split()[-1]: each
-        for each in run_references(inference_references(stages, workload), CPU, ONCE, silent)
-    }
-    assert len(comparisons) == 6
-    agreement = {name: each.agreement for name, each in comparisons.items()}
-    assert agreement["retrievaltemplate"] == {"same_top": 1.0}
-    assert agreement["matchingtemplate"] == {"same_matches": 1.0}
-    for solver in ("p3p", "epnp"):
-        found = agreement[f"PnP of 5 hypotheses{solver}"]
+def arrays(*tensors):
+    return [tensor.numpy() for tensor in tensors]
+
+
+def test_ransac_references_agree_with_ours(stages, workload):
+    comparisons = run_references(ransac_references(stages, workload), CPU, ONCE, silent)
+    assert [each.name.split(",")[0].split()[-1] for each in comparisons] == ["p3p", "epnp"]
+    for each in comparisons:
+        found = each.agreement
         assert found["mean_inliers_ours"] > 30
         assert found["mean_inliers_ours"] == pytest.approx(found["mean_inliers_reference"], rel=0.15)
-    polish = agreement["polish of 1 posescipy.optimize.least_squares"]
-    assert polish["degrees_apart"] < 0.02
-    assert polish["distance_apart"] < 1e-4
-    refinement = agreement["refinement of 1 hypothesisscipy.optimize.least_squares"]
-    assert refinement["cost_reference"] < refinement["cost_before"]
-    assert refinement["cost_ours"] == pytest.approx(refinement["cost_reference"], rel=0.03)
-    for each in comparisons.values():
         assert each.times_faster == pytest.approx(each.reference / each.ours)
+
+
+@torch.inference_mode()
+def test_retrieval_and_matching_template_by_template(stages, workload):
+    inputs, coarse = stage_inputs(stages, workload)
+    given, retriever = workload.representation, stages.retriever.retriever
+    found = retrieve_by_template(
+        *arrays(coarse.query.descriptors, coarse.query.valid, given.words, given.idf, given.template_bow),
+        sigma=retriever.bow.sigma,
+        num_nearest=retriever.bow.num_nearest,
+        num_templates=retriever.num_templates,
+        root=retriever.bow.normalization == "hellinger",
+    )
+    assert np.array_equal(found, retriever(*inputs["retriever"]).index)
+    matches = match_by_template(*arrays(*inputs["matcher"][:4]))
+    valid = np.broadcast_to(inputs["matcher"][1][:, None], matches.shape)
+    assert np.array_equal(matches[valid], stages.matcher(*inputs["matcher"]).template_patch.numpy()[valid])
+
+
+@torch.inference_mode()
+def test_polish_by_scipy(stages, workload):
+    """From a pose a little off, both come to the same pose on the inliers of the first problem."""
+    arguments = stage_inputs(stages, workload)[0]["pnp"]
+    found = stages.pnp(*arguments)
+    points_image, points_model, K = (x[:1] for x in arguments[:3])
+    start = turned(found.T_camera_from_model[:1], points_model[0], degrees=1.0)
+    weights = found.inliers[:1].to(K.dtype)
+    ours = LevenbergMarquardtPnp(max_iterations=30)(start, points_image, points_model, K, weights)
+    chosen = found.inliers[0]
+    T, x, u, k = arrays(start[0].double(), *(t[0].double() for t in (points_model, points_image, K)))
+    theirs = pnp_least_squares(T, x[chosen], u[chosen], k)
+    apart = pose_deviation(ours.T_camera_from_model[0].double(), theirs, unit=theirs[:3, 3].norm())
+    assert apart.rotation < 0.02
+    assert apart.translation < 1e-4
 
 
 def test_references_that_cannot_be_run_say_why(stages, workload, monkeypatch):
     monkeypatch.setattr("benchmarking.references.is_installed", lambda module: False)
-    references = inference_references(stages, workload)
+    references = ransac_references(stages, workload)
     words = kmeans_reference(torch.randn(50, 4), VisualWords(5), 10)
     lacking = [each for each in [*references, words] if each.unavailable]
     rows = run_references(lacking, CPU, ONCE, silent)
