@@ -31,6 +31,7 @@ from matplotlib.ticker import FuncFormatter, NullFormatter, NullLocator
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
+from ablation.plots import decorate, save_figure
 from benchmarking import ScriptedExtractor, Workload, WorkloadSizes, make_workload
 from benchmarking.hardware import describe_hardware, describe_versions
 from benchmarking.measure import return_free_memory
@@ -38,7 +39,7 @@ from foundpose import FoundPose
 from foundpose.config import clear_errors
 from foundpose.representation import ObjectRepresentation
 from foundpose.representation.quantization import Storage
-from foundpose.utils.files import write_atomically, write_json, write_text
+from foundpose.utils.files import write_json, write_text
 
 _MIB = 2**20
 _GIB = 2**30
@@ -132,9 +133,7 @@ def main(cfg: DictConfig) -> None:
         write_json(folder / "scaling.json", content)
         text = table(rows)
         write_text(folder / "scaling.md", text)
-        for suffix in (".png", ".pdf"):
-            picture = plot(rows)
-            write_atomically(folder / f"scaling{suffix}", lambda t, p=picture: p.savefig(t, dpi=150))  # type: ignore[misc]
+        save_figure(plot(rows), folder / "scaling")
         print(f"{text}\n{folder}")
 
 
@@ -296,9 +295,7 @@ def plot(rows: Sequence[Row]) -> Figure:
         panel.xaxis.set_minor_locator(NullLocator())
         panel.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         panel.set_xlabel("objects")
-        panel.grid(visible=True, color="0.9", linewidth=0.8)
-        panel.set_axisbelow(True)
-        panel.spines[["top", "right"]].set_visible(False)
+        decorate(panel)
     for panel in panels[:2]:
         panel.set_yscale("log")
         panel.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))

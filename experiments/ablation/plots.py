@@ -1,11 +1,12 @@
 """Figures of sweeps."""
 
-from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
@@ -54,19 +55,24 @@ def plot_sweep(
             f"no run that counts has both the setting {key!r} and {', '.join(lacking) or 'a figure'}; the settings "
             f"that vary: {varied_settings(list(records))}"
         )
-    values = _ordered([_value(run, key) for run in runs])
-    names = _ordered([_series_of(run, series) for run in runs])
+    table = pd.DataFrame(
+        {
+            "value": [_value(run, key) for run in runs],
+            "series": [_series_of(run, series) for run in runs],
+            **{name: [run.figures.get(name) for run in runs] for name in figures},
+        },
+    ).astype({"value": object, "series": object} | dict.fromkeys(figures, float))
+    values, names = _ordered(table["value"]), _ordered(table["series"])
     picture = Figure(figsize=(0.6 + 3.6 * len(figures), 3.1), layout=ConstrainedLayoutEngine(wspace=0.06))
     panels = picture.subplots(1, len(figures), squeeze=False)[0]
     for panel, name in zip(panels, figures, strict=True):
         _set_axis(panel, key, values)
         for i, each in enumerate(names):
-            chosen = [run for run in runs if _series_of(run, series) == each]
-            _draw_line(panel, chosen, key, name, values, "" if each is None else str(each), i)
+            line = table[[each is value or each == value for value in table["series"]]]
+            scaled = (line.set_index("value")[name] * unit_of(name).factor).dropna()
+            _draw_line(panel, scaled, values, "" if each is None else str(each), i)
         panel.set_ylabel(title_of(name))
-        panel.grid(visible=True, color="0.9", linewidth=0.8)
-        panel.set_axisbelow(True)
-        panel.spines[["top", "right"]].set_visible(False)
+        decorate(panel)
         if not name.startswith("AR"):
             # Time and memory are amounts: without zero, small changes look large.
             panel.set_ylim(0, 1.08 * panel.dataLim.ymax or 1.0)
@@ -78,35 +84,38 @@ def plot_sweep(
             ncols=min(len(names), 1 + 2 * len(figures)),
             frameon=False,
         )
+    return save_figure(picture, path)
+
+
+def decorate(panel: Axes) -> None:
+    """A light grid behind the data, and no box around it."""
+    panel.grid(visible=True, color="0.9", linewidth=0.8)
+    panel.set_axisbelow(True)
+    panel.spines[["top", "right"]].set_visible(False)
+
+
+def save_figure(figure: Figure, path: Path) -> list[Path]:
+    """Write a ``.png`` or ``.pdf`` file, or both where the path ends in neither, each whole or not at all."""
     files = [path] if path.suffix in _FORMATS else [path.with_name(path.name + suffix) for suffix in _FORMATS]
     for file in files:
         # Without a date, the same runs give the same file.
         metadata = {"CreationDate": None} if file.suffix == ".pdf" else {}
-        write_atomically(file, lambda temporary, m=metadata: picture.savefig(temporary, dpi=150, metadata=m))  # type: ignore[misc]
+        write_atomically(file, partial(figure.savefig, dpi=150, metadata=metadata))
     return files
 
 
-def _draw_line(
-    panel: Axes, runs: Sequence[RunRecord], key: str, figure: str, values: list[Any], label: str, index: int
-) -> None:
-    """One series: points of all runs, and a line through the means."""
-    factor = unit_of(figure).factor
-    at: dict[Any, list[float]] = defaultdict(list)
-    for run in runs:
-        value = run.figures.get(figure)
-        if value is not None:
-            at[_value(run, key)].append(value * factor)
-    color = f"C{index}"
-    places = [value for value in values if value in at]
-    xs = places if _is_numeric(values) else [values.index(value) for value in places]
-    means = [sum(at[value]) / len(at[value]) for value in places]
-    line = "-" if _is_numeric(values) else ":"
-    panel.plot(
-        xs, means, line, color=color, marker=_MARKERS[index % len(_MARKERS)], markersize=5, label=label
-    )
-    spread = [(x, y) for x, value in zip(xs, places, strict=True) for y in at[value] if len(at[value]) > 1]
-    if spread:
-        panel.plot(*zip(*spread, strict=True), linestyle="", marker=".", color=color, alpha=0.4)
+def _draw_line(panel: Axes, points: "pd.Series[float]", values: list[Any], label: str, index: int) -> None:
+    """One series, by the values of the setting: points of all runs, and a line through the means."""
+    numeric = _is_numeric(values)
+    style = {"color": f"C{index}", "marker": _MARKERS[index % len(_MARKERS)], "markersize": 5}
+    by_value = points.groupby(level=0)
+    means = by_value.mean().reindex([value for value in values if value in by_value.groups])
+    places = {value: value if numeric else values.index(value) for value in means.index}
+    panel.plot(list(places.values()), means, "-" if numeric else ":", label=label, **style)
+    spread = points[by_value.transform("size") > 1]
+    if len(spread):
+        xs = [places[value] for value in spread.index]
+        panel.plot(xs, spread, linestyle="", marker=".", color=style["color"], alpha=0.4)
 
 
 def _set_axis(panel: Axes, key: str, values: list[Any]) -> None:
@@ -136,7 +145,7 @@ def _is_numeric(values: Sequence[Any]) -> bool:
     return all(isinstance(value, (int, float)) and not isinstance(value, bool) for value in values)
 
 
-def _ordered(values: Sequence[Any]) -> list[Any]:
+def _ordered(values: Iterable[Any]) -> list[Any]:
     """Distinct values: numbers by size, others as text, None first."""
     distinct = list(dict.fromkeys(values))
     if _is_numeric(distinct):

@@ -4,6 +4,8 @@ from collections import defaultdict
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import pandas as pd
+
 from ablation.paper import (
     PaperDataset,
     PaperRow,
@@ -63,10 +65,10 @@ def paper_table(records: Sequence[RunRecord], table: int, format: Format = "mark
     runs = _runs_by_cell(records)
     for section in paper.sections:
         text.rows.append(Heading(section.title))
-        ranked = [_numbers(row) for row in section.rows]
-        for row in section.rows:
-            # The paper sets its best figures in bold in the first table only.
-            styles = _styles(row, ranked) if with_refinement else [_PLAIN] * len(numbers)
+        # The paper sets its best figures in bold in the first table only.
+        plain = [[_PLAIN] * len(numbers)] * len(section.rows)
+        ranked = _styles(section.rows) if with_refinement else plain
+        for row, styles in zip(section.rows, ranked, strict=True):
             text.rows.append(_paper_line(row, styles, with_refinement))
             if row.ours or row.peer:
                 ours = [_ours(_pick(runs, row, dataset.name), dataset) for dataset in datasets]
@@ -137,35 +139,29 @@ def _our_lines(
     row: PaperRow, ours: list[_Ours], text: TextTable, num_facts: int
 ) -> list[list[Cell] | Heading]:
     """Lines below a row of the paper: ours, and the difference if there is any."""
-    percents = [each.percent for each in ours]
-    times = [each.time for each in ours]
-    average = mean(percents)
-    time = mean(times)
+    percents, times = [each.percent for each in ours], [each.time for each in ours]
+    average, time = mean(percents), mean(times)
     cells = [
         Cell(each.text if each.percent is None else f"{each.percent:.1f}", text.note(each.note))
         for each in ours
     ]
-    cells.append(Cell(MISSING if average is None else f"{average:.1f}"))
     measured = [
-        f"{dataset.title} {significant(each.time)} s"
-        for dataset, each in zip(paper_datasets(), ours, strict=True)
-        if each.time is not None
+        f"{dataset.title} {significant(seconds)} s"
+        for dataset, seconds in zip(paper_datasets(), times, strict=True)
+        if seconds is not None
     ]
+    note = None
     if time is None and measured:
         note = text.note(f"Time ({row.experiment}), not on all seven datasets: {', '.join(measured)}.")
-        cells.append(Cell(MISSING, note))
-    else:
-        cells.append(Cell(MISSING if time is None else f"{time:.1f}"))
+    cells += [Cell(_one_decimal(average)), Cell(_one_decimal(time), note)]
     blank = [Cell("")] * (num_facts - 2)
     lines: list[list[Cell] | Heading] = [[Cell(""), Cell("ours", style="italic"), *blank, *cells]]
-    mine = [*percents, average, time]
     differences = [
-        None if a is None or b is None else _signed(round(a, 1) - b)
-        for a, b in zip(mine, _numbers(row), strict=True)
+        MISSING if a is None or b is None else _signed(round(a, 1) - b)
+        for a, b in zip([*percents, average, time], _numbers(row), strict=True)
     ]
-    if any(differences):
-        signed = [Cell(MISSING if each is None else each) for each in differences]
-        lines.append([Cell(""), Cell("difference", style="italic"), *blank, *signed])
+    if any(each != MISSING for each in differences):
+        lines.append([Cell(""), Cell("difference", style="italic"), *blank, *map(Cell, differences)])
     return lines
 
 
@@ -178,22 +174,23 @@ def _paper_line(row: PaperRow, styles: Sequence[Style], with_refinement: bool) -
     if with_refinement:
         facts += [row.refinement or MISSING, "✓" if row.no_training else "✗"]
     numbers = [
-        Cell(MISSING if number is None else f"{number:.1f}", style=style)
-        for number, style in zip(_numbers(row), styles, strict=True)
+        Cell(_one_decimal(number), style=style) for number, style in zip(_numbers(row), styles, strict=True)
     ]
-    return [*(Cell(fact) for fact in facts), *numbers]
+    return [*map(Cell, facts), *numbers]
 
 
-def _styles(row: PaperRow, section: list[list[float | None]]) -> list[Style]:
+def _styles(section: Sequence[PaperRow]) -> list[list[Style]]:
     """The paper sets the best figure of a section in bold and underlines the second best."""
-    styles: list[Style] = []
-    for i, number in enumerate(_numbers(row)):
-        is_time = i == len(section[0]) - 1
-        ranking = sorted({each[i] for each in section if each[i] is not None}, reverse=not is_time)  # type: ignore[type-var]
-        best: list[Style] = ["bold", "underline"]
-        rank = ranking.index(number) if number is not None else len(best)
-        styles.append(best[rank] if rank < len(best) else "plain")
-    return styles
+    numbers = pd.DataFrame([_numbers(row) for row in section], dtype=float)
+    numbers.iloc[:, :-1] *= -1  # the largest recall is the best, and the smallest time
+    styles: dict[float, Style] = {1.0: "bold", 2.0: "underline"}
+    return [
+        [styles.get(rank, "plain") for rank in ranks] for ranks in numbers.rank(method="dense").to_numpy()
+    ]
+
+
+def _one_decimal(number: float | None) -> str:
+    return MISSING if number is None else f"{number:.1f}"
 
 
 def _signed(difference: float) -> str:

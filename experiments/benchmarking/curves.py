@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import torch
 
@@ -48,7 +48,8 @@ class StageFactory(Protocol):
         """Stages; without ``stop_early`` RANSAC and Levenberg-Marquardt make all their iterations."""
 
 
-class Point(NamedTuple):
+@dataclass(frozen=True)
+class Point:
     """One measured point of a curve; times in seconds per crop.
 
     Attributes:

@@ -3,13 +3,12 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter, NullLocator
 
+from ablation.plots import decorate, save_figure
 from benchmarking.curves import AXES, Curve
 from benchmarking.tasks import Row
-from foundpose.utils.files import write_atomically
 
 _MARKERS = "osD^vP*X"
 _MILLISECONDS = 1e3
@@ -27,23 +26,13 @@ def plot_curve(curve: Curve, folder: Path) -> list[Path]:
     panel = figure.subplots()
     for i, (label, points) in enumerate(curve.series.items()):
         xs = [point.x for point in points]
-        color = f"C{i}"
-        panel.plot(
-            xs,
-            [point.median * _MILLISECONDS for point in points],
-            color=color,
-            marker=_MARKERS[i % len(_MARKERS)],
-            markersize=4,
-            label=label,
+        middle, lower, upper = (
+            [_MILLISECONDS * getattr(point, name) for point in points]
+            for name in ("median", "lower", "upper")
         )
-        panel.fill_between(
-            xs,
-            [point.lower * _MILLISECONDS for point in points],
-            [point.upper * _MILLISECONDS for point in points],
-            color=color,
-            alpha=0.15,
-            linewidth=0,
-        )
+        marker = _MARKERS[i % len(_MARKERS)]
+        panel.plot(xs, middle, color=f"C{i}", marker=marker, markersize=4, label=label)
+        panel.fill_between(xs, lower, upper, color=f"C{i}", alpha=0.15, linewidth=0)
     panel.set_xscale("log", base=2)
     ticks = sorted({point.x for points in curve.series.values() for point in points})
     panel.set_xticks(ticks)
@@ -60,10 +49,10 @@ def plot_curve(curve: Curve, folder: Path) -> list[Path]:
     panel.set_ylabel("ms per crop")
     if curve.batch_size is not None:
         panel.set_title(f"batch size {curve.batch_size}", fontsize="medium", loc="left")
-    _decorate(panel)
+    decorate(panel)
     columns = 3 if len(curve.series) > 2 else 1
     figure.legend(loc="outside lower center", ncols=columns, frameon=False, fontsize="small")
-    return _save(figure, folder / curve.name)
+    return save_figure(figure, folder / curve.name)
 
 
 def plot_shares(rows: Sequence[Row], shares: Sequence[float], title: str, path: Path) -> list[Path]:
@@ -84,21 +73,6 @@ def plot_shares(rows: Sequence[Row], shares: Sequence[float], title: str, path: 
     panel.set_xlim(0, 1.15 * max(percent, default=1.0))
     panel.set_xlabel("share of one forward pass of the yardstick, per crop (%)")
     panel.set_title(title, fontsize="medium", loc="left")
-    _decorate(panel)
+    decorate(panel)
     panel.grid(visible=False, axis="y")
-    return _save(figure, path)
-
-
-def _decorate(panel: Axes) -> None:
-    panel.grid(visible=True, color="0.9", linewidth=0.8)
-    panel.set_axisbelow(True)
-    panel.spines[["top", "right"]].set_visible(False)
-
-
-def _save(figure: Figure, path: Path) -> list[Path]:
-    files = [path.with_name(path.name + suffix) for suffix in (".png", ".pdf")]
-    for file in files:
-        # Without a date, the same figures give the same file.
-        metadata = {"CreationDate": None} if file.suffix == ".pdf" else {}
-        write_atomically(file, lambda temporary, m=metadata: figure.savefig(temporary, dpi=150, metadata=m))  # type: ignore[misc]
-    return files
+    return save_figure(figure, path)

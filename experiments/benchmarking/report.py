@@ -1,10 +1,12 @@
 """What a benchmark leaves behind: JSON, tables and plots."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
+
+import pandas as pd
 
 from ablation.text_tables import MISSING, text_table
 from benchmarking.checks import Check, shares
@@ -51,34 +53,23 @@ class BenchmarkResult:
 
     def as_json(self) -> dict[str, Any]:
         """All of it as plain values; rows know their shares of the yardstick and of the extractor."""
-        rows = [
-            asdict(row)
-            | {
-                "share_of_yardstick": self.share(row, YARDSTICK),
-                "share_of_extractor": self.share(row, HOOKED),
-            }
-            for row in self.rows
-        ]
-        curves = [
-            {
-                "name": curve.name,
-                "batch_size": curve.batch_size,
-                "series": {
-                    label: [point._asdict() for point in points] for label, points in curve.series.items()
-                },
-            }
-            for curve in self.curves
-        ]
         return {
             "schema_version": SCHEMA_VERSION,
             "settings": self.settings,
             "hardware": self.hardware,
             "versions": self.versions,
             "seconds": self.seconds,
-            "rows": rows,
-            "curves": curves,
+            "rows": [asdict(row) | self.shares(row) for row in self.rows],
+            "curves": [asdict(curve) for curve in self.curves],
             "references": [asdict(comparison) for comparison in self.comparisons],
             "checks": [asdict(check) | {"passed": check.passed} for check in self.checks],
+        }
+
+    def shares(self, row: Row) -> dict[str, float | None]:
+        """A row's shares of the yardstick and of the extractor."""
+        return {
+            "share_of_yardstick": self.share(row, YARDSTICK),
+            "share_of_extractor": self.share(row, HOOKED),
         }
 
     def share(self, row: Row, name: str) -> float | None:
@@ -138,62 +129,70 @@ def render(result: BenchmarkResult) -> str:
 
 def _rows_table(result: BenchmarkResult, rows: Sequence[Row], title: str) -> str:
     of_crops = any(row.unit == "crop" for row in rows)
-    titles = [title, "batch", "median", "quartiles", "n", f"per {'crop' if of_crops else 'unit'}"]
-    titles += ["% of yardstick", "% of extractor"] if of_crops else ["whole object"]
-    titles += ["memory", "note"]
     cells = []
     for row in rows:
-        line = [
-            row.name,
-            MISSING if row.batch_size is None else str(row.batch_size),
-            duration(row.median),
-            f"{duration(row.lower)} to {duration(row.upper)}",
-            str(row.calls),
-            duration(row.per_unit) if of_crops else f"{duration(row.per_unit)}/{row.unit}",
-        ]
+        line = {
+            title: row.name,
+            "batch": MISSING if row.batch_size is None else str(row.batch_size),
+            "median": duration(row.median),
+            "quartiles": f"{duration(row.lower)} to {duration(row.upper)}",
+            "n": str(row.calls),
+        }
         if of_crops:
-            line += [_percent(result.share(row, YARDSTICK)), _percent(result.share(row, HOOKED))]
+            line["per crop"] = duration(row.per_unit)
+            line["% of yardstick"] = _percent(result.share(row, YARDSTICK))
+            line["% of extractor"] = _percent(result.share(row, HOOKED))
         else:
-            line.append(MISSING if row.projected is None else f"{duration(row.projected)} (projected)")
-        line += [_mebibytes(row.memory_rise), _note(row)]
-        cells.append(line)
-    table = text_table(titles, cells)
-    table.numeric[-1] = False
-    reasons = {row.memory_reason for row in rows if row.memory_reason}
-    table.remarks += [f"memory: {reason}" for reason in sorted(reasons)]
-    return table.render("markdown")
+            line["per unit"] = f"{duration(row.per_unit)}/{row.unit}"
+            whole = row.projected
+            line["whole object"] = MISSING if whole is None else f"{duration(whole)} (projected)"
+        cells.append(line | {"memory": _mebibytes(row.memory_rise), "note": _note(row)})
+    reasons = sorted({row.memory_reason for row in rows if row.memory_reason})
+    return _markdown(cells, "note", [f"memory: {reason}" for reason in reasons])
 
 
 def _comparison_table(comparisons: Sequence[Comparison]) -> str:
     cells = []
     for each in comparisons:
         agreement = ", ".join(f"{name} {value:.4g}" for name, value in each.agreement.items())
-        if each.ours is None or each.reference is None or each.times_faster is None:
-            cells.append([each.name, MISSING, MISSING, MISSING, each.note])
-        else:
-            faster = f"{each.times_faster:.2g}×"
-            cells.append([each.name, duration(each.reference), duration(each.ours), faster, agreement])
-    table = text_table(["Reference", "reference", "ours", "ours is faster", "agreement"], cells)
-    table.numeric[-1] = False
-    return table.render("markdown")
+        faster = MISSING if each.times_faster is None else f"{each.times_faster:.2g}×"
+        cells.append(
+            {
+                "Reference": each.name,
+                "reference": duration(each.reference),
+                "ours": duration(each.ours),
+                "ours is faster": faster,
+                "agreement": agreement or each.note,
+            }
+        )
+    return _markdown(cells, "agreement")
 
 
 def _check_table(checks: Sequence[Check]) -> str:
     cells = [
-        [
-            check.name,
-            f"{check.value:.4g} {check.unit}",
-            f"{'≥' if check.at_least else '≤'} {check.limit:g} {check.unit}",
-            "yes" if check.passed else "no",
-        ]
+        {
+            "Check": check.name,
+            "measured": f"{check.value:.4g} {check.unit}",
+            "aim": f"{'≥' if check.at_least else '≤'} {check.limit:g} {check.unit}",
+            "met": "yes" if check.passed else "no",
+        }
         for check in checks
     ]
-    return text_table(["Check", "measured", "aim", "met"], cells).render("markdown")
+    return _markdown(cells)
 
 
-def duration(seconds: float) -> str:
+def _markdown(cells: Sequence[Mapping[str, str]], text: str = "", remarks: Sequence[str] = ()) -> str:
+    """A table of strings; its first column and the one named ``text`` are flush left."""
+    frame = pd.DataFrame(cells)
+    table = text_table(list(frame), frame.to_numpy().tolist())
+    table.numeric = [i > 0 and name != text for i, name in enumerate(frame)]
+    table.remarks += remarks
+    return table.render("markdown")
+
+
+def duration(seconds: float | None) -> str:
     """Seconds with three digits and a fitting unit."""
-    if not math.isfinite(seconds):
+    if seconds is None or not math.isfinite(seconds):
         return MISSING
     units = ((1.0, "s"), (1e3, "ms"), (1e6, "µs"))
     factor, unit = next((each for each in units if seconds * each[0] >= 1.0), units[-1])

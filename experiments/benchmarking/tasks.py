@@ -121,22 +121,14 @@ def run_task(task: Task, device: torch.device, settings: MeasureSettings) -> tup
 
 def _row(task: Task, measured: Measurement, host_syncs: int | None) -> Row:
     per_unit = measured.median / task.units
+    same = ("group", "name", "batch_size", "units", "unit", "note", "facts")
     return Row(
-        group=task.group,
-        name=task.name,
-        batch_size=task.batch_size,
-        units=task.units,
-        unit=task.unit,
-        median=measured.median,
-        lower=measured.lower,
-        upper=measured.upper,
-        calls=measured.calls,
+        **{name: getattr(task, name) for name in same},
+        **{name: getattr(measured, name) for name in ("median", "lower", "upper", "calls")},
         per_unit=per_unit,
         memory_rise=measured.memory.rise,
         memory_peak=measured.memory.peak,
         memory_reason=measured.memory.reason,
         host_syncs=host_syncs,
         projected=None if task.projected is None else per_unit * task.projected,
-        note=task.note,
-        facts=task.facts,
     )
