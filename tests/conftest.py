@@ -4,6 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from hypothesis import HealthCheck, settings
 
 from foundpose.features import CoordinateCode, PcaProjection
 from foundpose.geometry import SuperFibonacci
@@ -17,6 +18,17 @@ from tests.bop_dataset import make_bop_dataset
 if "PYTEST_XDIST_WORKER" in os.environ:
     # Processes that share the cores must not each take all of them.
     torch.set_num_threads(1)
+
+
+# How long an example takes says how busy the machine is.
+settings.register_profile("foundpose", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("foundpose")
+
+
+@pytest.fixture(autouse=True)
+def _seeded() -> None:
+    """What a test draws without a generator of its own depends on no test before it."""
+    torch.manual_seed(0)
 
 
 @pytest.fixture(scope="session")

@@ -341,13 +341,15 @@ HUB_SCRIPT = """
 import json, time
 from transformers import AutoConfig, Dinov2Model, SamModel
 from foundpose.features import DinoV2, Sam
+def waited():  # whatever the processor does meanwhile
+    return time.perf_counter() - time.process_time()
 for construct in (lambda: DinoV2("vits14", 1, config=SIZES), lambda: Sam("vitb", 1)):
-    start = time.perf_counter()
+    start = waited()
     try:
         found = construct().fingerprint()["weights"]
     except OSError as error:
         found = f"{type(error).__name__}: {error}"
-    print(json.dumps([time.perf_counter() - start, found]))
+    print(json.dumps([waited() - start, found]))
 """
 
 

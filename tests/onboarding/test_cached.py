@@ -260,7 +260,7 @@ def test_two_processes_onboard_an_object_once(blob, tmp_path, with_artefacts):
     job = context.Process(target=onboard, args=(tmp_path, with_artefacts, barrier, queue))
     job.start()
     onboard(tmp_path, with_artefacts, barrier, queue)  # this process is the other one
-    results = [queue.get(timeout=120) for _ in range(2)]
+    results = [queue.get(timeout=600) for _ in range(2)]
     job.join()
     # Three batches of templates; the renderer renders them and the depths at the patches.
     counts = sorted((tuple(counts.values()) for counts, _, _ in results), reverse=True)
@@ -278,7 +278,7 @@ def test_two_processes_onboard_an_object_once(blob, tmp_path, with_artefacts):
 def test_a_killed_job_loses_only_the_stage_that_it_was_at(blob, tmp_path, monkeypatch):
     job = multiprocessing.get_context("spawn").Process(target=die_while_writing_descriptors, args=(tmp_path,))
     job.start()
-    job.join(timeout=120)
+    job.join(timeout=600)
     assert job.exitcode == -signal.SIGKILL
     artefacts = ArtefactStore(tmp_path / "artefacts")
     assert [entry.kind for entry in artefacts.entries()] == ["patches", "renderings"]
