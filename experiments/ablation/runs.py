@@ -211,7 +211,7 @@ def write_reports(folder: str | Path) -> list[RunRecord]:
             series = apart[0] if apart else "dataset" if several else None
             plot_sweep(drawn, key, figures, folder / "plots" / name, series)
     for name, text in tables.items():
-        _write_text(folder / "tables" / name, text)
+        write_text(folder / "tables" / name, text)
     return records
 
 
@@ -266,7 +266,3 @@ def _telling_apart(groups: Sequence[Sequence[RunRecord]], key: str) -> list[str]
         if len(values) > kinds:
             chosen, kinds = [*chosen, candidate], len(values)
     return chosen
-
-
-def _write_text(path: Path, text: str) -> None:
-    write_text(path, text)
