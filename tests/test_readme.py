@@ -23,7 +23,7 @@ def test_the_python_example_runs(tmp_path, monkeypatch, capsys):
     # Fewer templates and words, and this picture's camera; all else as it stands there.
     K = scene.K
     for old, new in {
-        "SuperFibonacci(800)": "SuperFibonacci(200)",
+        "SuperFibonacci(800)": "SuperFibonacci(100)",
         "VisualWords(2048)": "VisualWords(1024)",
         "(600, 600, 319.5, 239.5)": f"({K[0, 0]}, {K[1, 1]}, {K[0, 2]}, {K[1, 2]})",
     }.items():

@@ -52,7 +52,7 @@ def own_picture(tmp_path_factory):
         f"mesh={folder / 'cup.ply'}",
         f"intrinsics=[{K[0, 0]},{K[1, 1]},{K[0, 2]},{K[1, 2]}]",
         "extractor=dense_sift",
-        "viewpoints.count=200",
+        "viewpoints.count=100",
         "words.num_words=1024",
         f"representations={folder / 'representations'}",
     ]
