@@ -107,15 +107,17 @@ def save_figure(figure: Figure, path: Path) -> list[Path]:
 def _draw_line(panel: Axes, points: "pd.Series[float]", values: list[Any], label: str, index: int) -> None:
     """One series, by the values of the setting: points of all runs, and a line through the means."""
     numeric = _is_numeric(values)
-    style = {"color": f"C{index}", "marker": _MARKERS[index % len(_MARKERS)], "markersize": 5}
+    color, marker = f"C{index}", _MARKERS[index % len(_MARKERS)]
     by_value = points.groupby(level=0)
     means = by_value.mean().reindex([value for value in values if value in by_value.groups])
     places = {value: value if numeric else values.index(value) for value in means.index}
-    panel.plot(list(places.values()), means, "-" if numeric else ":", label=label, **style)
+    line = "-" if numeric else ":"
+    xs = list(places.values())
+    panel.plot(xs, means, line, color=color, marker=marker, markersize=5, label=label)
     spread = points[by_value.transform("size") > 1]
     if len(spread):
-        xs = [places[value] for value in spread.index]
-        panel.plot(xs, spread, linestyle="", marker=".", color=style["color"], alpha=0.4)
+        at = [places[value] for value in spread.index]
+        panel.plot(at, spread, linestyle="", marker=".", color=color, alpha=0.4)
 
 
 def _set_axis(panel: Axes, key: str, values: list[Any]) -> None:

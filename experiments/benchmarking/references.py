@@ -91,9 +91,8 @@ def _compare(each: Reference, device: torch.device, settings: MeasureSettings) -
         for name, (call, where) in calls.items():
             seconds[name] = measure(lambda n=name, c=call: last.update({n: c()}), where, how).median  # type: ignore[misc]
         agreement = each.agreement(last["ours"], last["reference"])
-    return Comparison(
-        each.name, **seconds, times_faster=seconds["reference"] / seconds["ours"], agreement=agreement
-    )
+    ours, reference = seconds["ours"], seconds["reference"]
+    return Comparison(each.name, ours, reference, reference / ours, agreement)
 
 
 def ransac_references(stages: Stages, workload: Workload) -> list[Reference]:
