@@ -104,7 +104,7 @@ def memory_table(
             )
         )
         printed[name] = f"{each['printed_mb']} MB"
-    bytes_ = pd.DataFrame.from_dict(sizes, orient="index", dtype=float)
+    bytes_ = pd.DataFrame(sizes).T.astype(float)
     total = bytes_.pop("total")
     share = bytes_.div(total, axis=0).max()
     small = sorted(share.index[share < _SMALL])
@@ -112,7 +112,7 @@ def memory_table(
     if small:
         shown["others"] = bytes_[small].sum(axis=1, min_count=1)
     shown["total"] = total
-    cells = shown.map(_mebibytes).assign(printed=printed).reset_index(names="MiB")
+    cells = shown.map(_mebibytes).assign(printed=pd.Series(printed)).reset_index(names="MiB")
     table = text_table(list(cells.columns), cells.to_numpy().tolist())
     table.caption = "Memory of an object representation"
     table.key = "memory"

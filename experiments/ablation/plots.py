@@ -57,11 +57,11 @@ def plot_sweep(
         )
     table = pd.DataFrame(
         {
-            "value": [_value(run, key) for run in runs],
-            "series": [_series_of(run, series) for run in runs],
-            **{name: [run.figures.get(name) for run in runs] for name in figures},
-        },
-    ).astype({"value": object, "series": object} | dict.fromkeys(figures, float))
+            "value": pd.Series([_value(run, key) for run in runs], dtype=object),
+            "series": pd.Series([_series_of(run, series) for run in runs], dtype=object),
+            **{name: pd.Series([run.figures.get(name) for run in runs], dtype=float) for name in figures},
+        }
+    )
     values, names = _ordered(table["value"]), _ordered(table["series"])
     picture = Figure(figsize=(0.6 + 3.6 * len(figures), 3.1), layout=ConstrainedLayoutEngine(wspace=0.06))
     panels = picture.subplots(1, len(figures), squeeze=False)[0]
@@ -108,13 +108,13 @@ def _draw_line(panel: Axes, points: "pd.Series[float]", values: list[Any], label
     """One series, by the values of the setting: points of all runs, and a line through the means."""
     numeric = _is_numeric(values)
     color, marker = f"C{index}", _MARKERS[index % len(_MARKERS)]
-    by_value = points.groupby(level=0)
+    by_value = points.groupby(level=0, sort=False)
     means = by_value.mean().reindex([value for value in values if value in by_value.groups])
     places = {value: value if numeric else values.index(value) for value in means.index}
     line = "-" if numeric else ":"
     xs = list(places.values())
     panel.plot(xs, means, line, color=color, marker=marker, markersize=5, label=label)
-    spread = points[by_value.transform("size") > 1]
+    spread = points[(by_value.transform("size") > 1).to_numpy()]
     if len(spread):
         at = [places[value] for value in spread.index]
         panel.plot(at, spread, linestyle="", marker=".", color=color, alpha=0.4)

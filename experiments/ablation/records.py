@@ -151,8 +151,10 @@ def write_tidy(records: Iterable[RunRecord], path: str | Path) -> Path:
     path, table = Path(path), tidy(records)
     if table.empty:
         raise ValueError(f"there are no runs to write to {path}")
-    words = table.map(lambda value: str(value).lower() if isinstance(value, bool) else value)
-    write_atomically(path, lambda temporary: words.to_csv(temporary, index=False))
+    for name, column in table.items():
+        words = [str(value).lower() if isinstance(value, bool) else value for value in column]
+        table[name] = pd.Series(words, dtype=object)
+    write_atomically(path, lambda temporary: table.to_csv(temporary, index=False))
     return path
 
 

@@ -50,7 +50,7 @@ def sweep_table(
     titles = list(heads.columns) + [title_of(name) for name in figures]
     numeric = [bool(heads[head].map(_is_number).all()) for head in heads.columns]
     text = TextTable(titles, numeric + [True] * len(figures), key="sweep")
-    groups = heads.groupby(list(heads.columns), sort=False).indices
+    groups = {values: part.index for values, part in heads.groupby(list(heads.columns), sort=False)}
     for values in sorted(groups, key=lambda values: [_sort_key(value) for value in values]):
         runs = [records[i] for i in groups[values]]
         text.rows.append([Cell(value) for value in values] + _cells(runs, figures, text))
@@ -78,7 +78,11 @@ def _show(value: Any) -> str:
 
 
 def _is_number(text: str) -> bool:
-    return text == MISSING or not pd.isna(pd.to_numeric(text, errors="coerce"))
+    try:
+        float(text)
+    except ValueError:
+        return text == MISSING
+    return True
 
 
 def _sort_key(text: str) -> tuple[int, float, str]:

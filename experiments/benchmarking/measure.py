@@ -1,6 +1,7 @@
 """Time and memory of a call."""
 
 import ctypes
+import re
 import time
 import warnings
 from collections.abc import Callable, Sequence
@@ -12,6 +13,7 @@ import numpy as np
 import psutil
 import torch
 
+_STATUS = Path("/proc/self/status")
 _RESET_PEAK = Path("/proc/self/clear_refs")
 
 
@@ -201,7 +203,8 @@ def return_free_memory() -> None:
 
 
 def _peak_resident() -> int:
-    """Largest resident size since the peak was reset, which Linux counts in KiB."""
-    import resource  # not on every system; where it is missing the peak cannot be reset either
-
-    return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    """Largest resident size since the peak was set back, which psutil does not know."""
+    found = re.search(r"^VmHWM:\s*(\d+) kB", _STATUS.read_text(), re.MULTILINE)
+    if found is None:
+        raise OSError(f"{_STATUS} has no VmHWM")
+    return 1024 * int(found[1])
