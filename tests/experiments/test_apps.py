@@ -22,7 +22,7 @@ from tests.bop_dataset import write_ply
 
 ROOT = Path(__file__).resolve().parents[2]
 # Small, but everything is in it.
-SMALL = ["viewpoints.count=60", "words.num_words=128", "projection.num_components=64", "crop.size=280"]
+SMALL = ["viewpoints.count=60", "words.num_words=128", "projection.num_components=64"]
 
 
 def run_app(monkeypatch, name, *overrides):
@@ -52,7 +52,7 @@ def own_picture(tmp_path_factory):
         f"mesh={folder / 'cup.ply'}",
         f"intrinsics=[{K[0, 0]},{K[1, 1]},{K[0, 2]},{K[1, 2]}]",
         "extractor=dense_sift",
-        "viewpoints.count=100",
+        "viewpoints.count=200",
         "words.num_words=1024",
         f"representations={folder / 'representations'}",
     ]
