@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from ablation import find_paper_row, paper_datasets, paper_numbers, read_paper_table
-from ablation.tables import _styles
+from ablation.tables import _numbers, _styles
 
 LABELS = {1: "tab:main_results", 2: "tab:ablations"}
 
