@@ -13,7 +13,7 @@ import pytest
 from foundpose.bop import check_times, read_results
 from foundpose.evaluation.shards import shard_path
 from tests.bop_dataset import make_bop_dataset
-from tests.experiments.test_apps import SMALL, run_app
+from tests.experiments.test_apps import SMALL, run_app, run_app_on_one_thread
 
 ROOT = Path(__file__).resolve().parents[2]
 NUM_IMAGES = 6
@@ -46,8 +46,7 @@ def arguments(root, representations):
 def reference(arguments, tmp_path_factory):
     """A run left alone, of one process."""
     folder = tmp_path_factory.mktemp("reference")
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        run_app(monkeypatch, "evaluate", *arguments, f"hydra.run.dir={folder}")
+    run_app_on_one_thread("evaluate", *arguments, f"hydra.run.dir={folder}")
     return folder
 
 

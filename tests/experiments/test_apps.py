@@ -32,6 +32,17 @@ def run_app(monkeypatch, name, *overrides):
     runpy.run_path(str(ROOT / "experiments" / f"{name}.py"), run_name="__main__")
 
 
+def run_app_on_one_thread(name, *overrides):
+    """Run an app in this process, with the rounding of one that has a single thread."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with pytest.MonkeyPatch.context() as monkeypatch:
+            run_app(monkeypatch, name, *overrides)
+    finally:
+        torch.set_num_threads(threads)
+
+
 @pytest.fixture(scope="module")
 def own_picture(tmp_path_factory):
     """A photograph, a mask and a mesh as files, and the truth.
@@ -199,8 +210,7 @@ def bop_arguments(root, folder):
 def left_alone(tiny_bop, tmp_path_factory):
     """A folder with the onboarded objects, and in ``run`` what nobody interrupted."""
     folder = tmp_path_factory.mktemp("alone")
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        run_app(monkeypatch, "estimate", *bop_arguments(tiny_bop, folder), f"hydra.run.dir={folder / 'run'}")
+    run_app_on_one_thread("estimate", *bop_arguments(tiny_bop, folder), f"hydra.run.dir={folder / 'run'}")
     return folder
 
 
