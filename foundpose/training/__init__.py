@@ -3,30 +3,21 @@
 Imports pytorch_lightning, as only ``foundpose.evaluation`` does besides.
 """
 
-from foundpose.training.adapter import (
-    AdapterTraining,
-    PairBatch,
-    PairDataModule,
-    PairLoss,
-    PairPoses,
-    PairSettings,
-    PatchPairs,
-    evaluate_scenes,
-    make_pairs,
-)
+from foundpose.training.adapter.data import PairDataModule
+from foundpose.training.adapter.evaluation import evaluate_scenes
+from foundpose.training.adapter.pairs import PairBatch, PairSettings, PatchPairs, make_pairs
+from foundpose.training.adapter.training import AdapterTraining, PairLoss, PairPoses
 from foundpose.training.base import EpochShuffle, RenderedDataModule
 from foundpose.training.errors import PoseErrors, compare, summarize
-from foundpose.training.refiner import (
+from foundpose.training.refiner.data import (
     Perturbation,
     PictureSettings,
     RefinerBatch,
     RefinerDataModule,
-    RefinerLoss,
     RefinerPictures,
-    RefinerTraining,
-    disentangled_error,
-    evaluate_refiner,
 )
+from foundpose.training.refiner.evaluation import evaluate_refiner
+from foundpose.training.refiner.training import RefinerLoss, RefinerTraining, disentangled_error
 from foundpose.training.views import (
     TemplateViews,
     TrueCrops,
