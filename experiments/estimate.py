@@ -22,6 +22,7 @@ from tqdm import tqdm
 from foundpose.bop import (
     BopDataset,
     Instance,
+    best_of_targets,
     read_image,
     read_mask,
     result_file_name,
@@ -31,7 +32,6 @@ from foundpose.config import Method, build_method, claim_run_folder, clear_error
 from foundpose.evaluation.objects import DatasetObjects
 from foundpose.evaluation.records import (
     add_image_times,
-    best_results,
     instance_record,
     pose_records,
     to_results,
@@ -176,7 +176,7 @@ def estimate_dataset(cfg: DictConfig, output: Path) -> None:
     add_image_times(entries)
     write_json(output / "estimates.json", entries)
     csv = output / result_file_name(cfg.method, dataset.name, cfg.data.split)
-    results = best_results(to_results(entries), dataset.targets())
+    results = best_of_targets(to_results(entries), dataset.targets())
     write_results(csv, results)
     valid = sum(entry["valid"] for entry in entries)
     print(f"{len(entries)} instances in {len(images)} images, {valid} with a pose; written to {csv}")

@@ -23,6 +23,7 @@ from pytorch_lightning.loggers import CSVLogger
 from safetensors.torch import load_file, save_file
 from tqdm import tqdm
 
+from foundpose.bop.files import parse_models_info, read_json
 from foundpose.config import build_method, claim_run_folder, clear_errors
 from foundpose.features import ResidualAdapter
 from foundpose.geometry import Symmetries, stack_symmetries, symmetries_from_models_info
@@ -106,7 +107,8 @@ def wanted_symmetries(cfg: DictConfig, name: str) -> Symmetries | None:
     files = [cfg[name]] if isinstance(cfg[name], str) else cfg[name]
     if cfg.models_info is None or files is None or isinstance(files, int):
         return None
-    entries = {int(key): entry for key, entry in json.loads(Path(cfg.models_info).read_text()).items()}
+    path = Path(cfg.models_info)
+    entries = parse_models_info(read_json(path), path)
     found = []
     for file in files:
         number = re.fullmatch(r"obj_(\d+)", Path(file).stem)

@@ -6,7 +6,7 @@ from typing import Any
 
 from torch import Tensor
 
-from foundpose.bop.files import BopError, JsonCache
+from foundpose.bop.files import BopError, JsonCache, parse_models_info
 from foundpose.bop.masks import read_mask
 from foundpose.bop.scenes import Annotation, parse_annotations, parse_depth_scale, parse_intrinsics
 from foundpose.bop.targets import Target, count_visible, describe_target, parse_targets
@@ -254,12 +254,7 @@ class BopDataset:
 
     def _read_models_info(self, folder: Path) -> dict[int, dict[str, Any]]:
         path = folder / "models_info.json"
-        content = self._cache.read(path)
-        if not isinstance(content, dict) or not all(
-            key.isdecimal() and isinstance(value, dict) for key, value in content.items()
-        ):
-            raise BopError(f"{path} must map object ids to entries")
-        return {int(key): value for key, value in content.items()}
+        return parse_models_info(self._cache.read(path), path)
 
 
 def _mesh_path(folder: Path, infos: dict[int, dict[str, Any]], obj_id: int) -> Path:

@@ -31,6 +31,19 @@ def read_json(path: Path, object_hook: Callable[[dict[str, Any]], Any] | None = 
         raise BopError(f"{path} is not valid JSON: {error}") from error
 
 
+def parse_models_info(content: Any, path: Path) -> dict[int, dict[str, Any]]:
+    """Entries of a ``models_info.json`` by object id.
+
+    Raises:
+        BopError: the content is something else.
+    """
+    if not isinstance(content, dict) or not all(
+        key.isdecimal() and isinstance(value, dict) for key, value in content.items()
+    ):
+        raise BopError(f"{path} must map object ids to entries")
+    return {int(key): value for key, value in content.items()}
+
+
 class JsonCache:
     """Contents of the JSON files read last; a file that has changed is read again.
 

@@ -148,35 +148,30 @@ def _parse_row(fields: list[str]) -> PoseResult:
     return PoseResult(int(fields[0]), int(fields[1]), int(fields[2]), score, T, time)
 
 
-def best_of_targets(
-    keys: Sequence[tuple[int, int, int]], scores: Sequence[float], targets: Iterable[Target]
-) -> list[int]:
-    """Which estimates to hand in: for each target as many as it has instances, those of highest score.
+def best_of_targets(results: Sequence[PoseResult], targets: Iterable[Target]) -> list[PoseResult]:
+    """What to hand in: of each target as many results as it has instances, those of highest score.
 
     Args:
-        keys: (scene, image, object) of each estimate.
-        scores: score of each estimate; of equal ones the first wins.
-        targets: what was to be found. Of a target that is an image (bop24) all estimates are kept.
+        results: the results; of equal scores the first wins.
+        targets: what was to be found. Of a target that is an image (bop24) all results are kept.
 
     Returns:
-        Indices of the estimates kept, ascending. Those of other objects and images than the targets' are dropped.
+        In the order given. Those of other objects and images than the targets' are dropped.
 
     Raises:
-        ValueError: different numbers of keys and scores, or a score that is NaN.
+        ValueError: a score is NaN.
     """
-    if len(keys) != len(scores):
-        raise ValueError(f"keys and scores must be equally many, got {len(keys)} and {len(scores)}")
-    if any(map(math.isnan, scores)):
-        raise ValueError(f"scores must be numbers, score {[*map(math.isnan, scores)].index(True)} is NaN")
     found: dict[tuple[int, int, int | None], list[int]] = defaultdict(list)
-    for i, (scene_id, im_id, obj_id) in enumerate(keys):
-        found[scene_id, im_id, obj_id].append(i)
-        found[scene_id, im_id, None].append(i)
+    for i, result in enumerate(results):
+        if math.isnan(result.score):
+            raise ValueError(f"scores must be numbers, score {i} is NaN")
+        found[result.scene_id, result.im_id, result.obj_id].append(i)
+        found[result.scene_id, result.im_id, None].append(i)
     kept: set[int] = set()
     for target in targets:
         mine = found[target[:3]]
-        kept.update(mine[i] for i in best([scores[i] for i in mine], target.inst_count))
-    return sorted(kept)
+        kept.update(mine[i] for i in best([results[i].score for i in mine], target.inst_count))
+    return [results[i] for i in sorted(kept)]
 
 
 def result_file_name(method: str, dataset: str, split: str) -> str:

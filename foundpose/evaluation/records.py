@@ -1,12 +1,12 @@
 """Estimates as plain records: what is written to JSON and to BOP's results file."""
 
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 
-from foundpose.bop import Instance, PoseResult, Target, best_of_targets
+from foundpose.bop import Instance, PoseResult
 from foundpose.pipeline.results import PoseEstimates, PoseStatus
 
 
@@ -93,10 +93,3 @@ def to_results(records: Sequence[dict[str, Any]]) -> list[PoseResult]:
             ids = (record["scene_id"], record["im_id"], record["obj_id"])
             results.append(PoseResult(*ids, record["score"], T, record["time"]))
     return results
-
-
-def best_results(results: Sequence[PoseResult], targets: Iterable[Target]) -> list[PoseResult]:
-    """As many results of each target as it has instances, those of highest score, in the order given."""
-    keys = [(result.scene_id, result.im_id, result.obj_id) for result in results]
-    kept = best_of_targets(keys, [result.score for result in results], targets)
-    return [results[i] for i in kept]

@@ -14,6 +14,7 @@ from foundpose.bop import (
     PoseResult,
     Scores,
     Target,
+    best_of_targets,
     check_functions,
     check_times,
     read_results,
@@ -25,7 +26,7 @@ from foundpose.config import build_method, claim_run_folder, wanted_objects
 from foundpose.evaluation.data import PoseDataModule
 from foundpose.evaluation.module import PoseEvaluation, estimate_dataset
 from foundpose.evaluation.objects import DatasetObjects
-from foundpose.evaluation.records import best_results, to_results
+from foundpose.evaluation.records import to_results
 from foundpose.evaluation.report import all_records, in_words, merge_shards, timing, unanswered
 from foundpose.utils.files import write_json
 from foundpose.utils.progress import ProgressBars
@@ -58,7 +59,7 @@ def run_evaluation(cfg: DictConfig, output: Path) -> Scores | None:
         records = _estimate(cfg, dataset, wanted, output)
         if records is None:
             return None
-        results = best_results(to_results(records), dataset.targets())
+        results = best_of_targets(to_results(records), dataset.targets())
         path = output / result_file_name(cfg.method, dataset.name, cfg.data.split)
         write_results(path, results)
         print(f"{len(records)} instances, {sum(r['valid'] for r in records)} with a pose; written to {path}")

@@ -160,18 +160,22 @@ def test_a_published_submission(lmo_root, tmp_path):
 def test_best_of_targets():
     keys = [(1, 0, 5), (1, 0, 5), (1, 0, 6), (1, 0, 5), (1, 1, 5), (2, 0, 5), (1, 0, 5)]
     scores = [0.3, 0.5, 0.1, 0.5, 0.9, 0.9, 0.2]
+    T = torch.eye(4, dtype=torch.float64)
+    results = [PoseResult(*key, score, T, 0.1) for key, score in zip(keys, scores, strict=True)]
     target = Target(1, 0, 5, 1)
-    assert best_of_targets(keys, scores, [target]) == [1]
-    assert best_of_targets(keys, scores, [target._replace(inst_count=2)]) == [1, 3]
-    assert best_of_targets(keys, scores, [target._replace(inst_count=3)]) == [0, 1, 3]
-    assert best_of_targets(keys, scores, [target._replace(inst_count=9)]) == [0, 1, 3, 6]
-    assert best_of_targets(keys, scores, [Target(2, 0, 5, 1), target, Target(3, 0, 5, 1)]) == [1, 5]
-    assert best_of_targets(keys, scores, [Target(1, 0, None, None)]) == [0, 1, 2, 3, 6]
-    assert best_of_targets([], [], [target]) == []
-    with pytest.raises(ValueError, match="must be equally many, got 7 and 1"):
-        best_of_targets(keys, [0.1], [target])
+
+    def kept(*targets):
+        return [next(i for i in range(7) if results[i] is r) for r in best_of_targets(results, targets)]
+
+    assert kept(target) == [1]
+    assert kept(target._replace(inst_count=2)) == [1, 3]
+    assert kept(target._replace(inst_count=3)) == [0, 1, 3]
+    assert kept(target._replace(inst_count=9)) == [0, 1, 3, 6]
+    assert kept(Target(2, 0, 5, 1), target, Target(3, 0, 5, 1)) == [1, 5]
+    assert kept(Target(1, 0, None, None)) == [0, 1, 2, 3, 6]
+    assert best_of_targets([], [target]) == []
     with pytest.raises(ValueError, match="score 1 is NaN"):
-        best_of_targets(keys[:2], [0.1, math.nan], [target])
+        best_of_targets([results[0], dataclasses.replace(results[1], score=math.nan)], [target])
 
 
 @pytest.mark.parametrize(
