@@ -1,7 +1,6 @@
 """Instances of a dataset in whole, fixed batches across images and objects, shared out among processes."""
 
 import time
-from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple, get_args
@@ -83,7 +82,6 @@ class InstanceBatches(Dataset[PoseBatch]):
         dataset: where images, intrinsics and masks come from.
         pictures: makes the picture of an image (:class:`foundpose.bop.pictures.Photographs`, for one).
         batches: the plan.
-        images_kept: pictures kept for the next batch, which often begins with the image that the last ended with.
     """
 
     def __init__(
@@ -91,13 +89,11 @@ class InstanceBatches(Dataset[PoseBatch]):
         dataset: BopDataset,
         pictures: Callable[[BopDataset, int, int], Tensor],
         batches: Sequence[Sequence[Instance]],
-        images_kept: int = 4,
     ) -> None:
         self.dataset = dataset
         self.pictures = pictures
         self.batches = batches
-        self.images_kept = images_kept
-        self._kept: OrderedDict[tuple[int, int], Tensor] = OrderedDict()
+        self._last: dict[tuple[int, int], Tensor] = {}
 
     def __len__(self) -> int:
         return len(self.batches)
@@ -106,9 +102,13 @@ class InstanceBatches(Dataset[PoseBatch]):
         start = time.perf_counter()
         instances = self.batches[index]
         keys = list(dict.fromkeys((i.scene_id, i.im_id) for i in instances))
+        # A batch often begins with the image that the one before ended with.
+        self._last = {
+            key: self._last[key] if key in self._last else self.pictures(self.dataset, *key) for key in keys
+        }
         return PoseBatch(
             number=index,
-            images=tuple(self._image(*key) for key in keys),
+            images=tuple(self._last.values()),
             K=torch.stack([self.dataset.intrinsics(*key).float() for key in keys]),
             masks=tuple(instance.mask(self.dataset) for instance in instances),
             image_index=tuple(keys.index((i.scene_id, i.im_id)) for i in instances),
@@ -116,15 +116,6 @@ class InstanceBatches(Dataset[PoseBatch]):
             instances=tuple(instances),
             seconds=time.perf_counter() - start,
         )
-
-    def _image(self, scene_id: int, im_id: int) -> Tensor:
-        key = (scene_id, im_id)
-        if key not in self._kept:
-            self._kept[key] = self.pictures(self.dataset, scene_id, im_id)
-            while len(self._kept) > self.images_kept:
-                self._kept.popitem(last=False)
-        self._kept.move_to_end(key)
-        return self._kept[key]
 
 
 class BatchesOfRank(DistributedSampler[int]):
