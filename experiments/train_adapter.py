@@ -209,7 +209,7 @@ def train(
         instantiate(cfg.pairs),
         cfg.batch_size,
         cfg.seed,
-        output / "pairs",
+        output / "artefacts",
         ProgressBars("train"),
         symmetries["meshes"],
         symmetries["validation"],

@@ -12,13 +12,12 @@ _GROUP = 64
 
 
 def find_nearest(
-    points: Tensor, squared_norms: Tensor, centroids: Tensor, with_second: bool = False
+    points: Tensor, centroids: Tensor, with_second: bool = False
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     """Nearest centroid of each point; the memory is that of one block of scores.
 
     Args:
-        points: (N, d), floating point; bfloat16 points make the products in bfloat16.
-        squared_norms: (N,) squared norms of the points, in the dtype of ``centroids``.
+        points: (N, d), floating point.
         centroids: (k, d).
         with_second: whether to tell the distance to the second nearest centroid, too.
 
@@ -30,28 +29,29 @@ def find_nearest(
     norms = centroids.square().sum(dim=1)
     padding = -k % _GROUP
     norms = F.pad(norms, (0, padding), value=torch.inf)
-    transposed = F.pad(centroids, (0, 0, 0, padding)).to(points.dtype).T
+    transposed = F.pad(centroids, (0, 0, 0, padding)).T
     groups = (k + padding) // _GROUP
     budget = _CPU_SCORES_PER_BLOCK if points.device.type == "cpu" else _GPU_SCORES_PER_BLOCK
     rows = max(1, budget // (groups * _GROUP))
     # Written in place: small results kept from each block would fragment the heap between the large ones.
-    index = torch.empty(points.shape[0], dtype=torch.int64, device=points.device)
-    cost = torch.empty_like(squared_norms)
-    second_cost = torch.empty_like(squared_norms) if with_second else None
+    index = points.new_empty(len(points), dtype=torch.int64)
+    cost = points.new_empty(len(points))
+    second_cost = torch.empty_like(cost) if with_second else None
     for start in range(0, points.shape[0], rows):
         block = slice(start, start + rows)
+        x = points[block]
         # |x|² is the same for all centroids and is added at the end.
-        scores = torch.sub(norms, (points[block] @ transposed).to(norms.dtype), alpha=2.0)
+        scores = torch.sub(norms, x @ transposed, alpha=2.0)
         grouped = scores.unflatten(1, (groups, _GROUP))
         group = grouped.amin(dim=2).argmin(dim=1)
         nearest = grouped.gather(1, group[:, None, None].expand(-1, 1, _GROUP)).squeeze(1).min(dim=1)
-        cost[block] = nearest.values
+        squared_norms = torch.linalg.vector_norm(x, dim=1).square()
+        cost[block] = nearest.values.add_(squared_norms).clamp_(min=0)
         index[block] = group * _GROUP + nearest.indices
         if second_cost is not None:
-            second_cost[block] = scores.scatter_(1, index[block, None], torch.inf).amin(dim=1)
-    if second_cost is not None:
-        second_cost = second_cost.add_(squared_norms).clamp_(min=0)
-    return index, cost.add_(squared_norms).clamp_(min=0), second_cost
+            second = scores.scatter_(1, index[block, None], torch.inf).amin(dim=1)
+            second_cost[block] = second.add_(squared_norms).clamp_(min=0)
+    return index, cost, second_cost
 
 
 def cluster_means(points: Tensor, assignment: Tensor, centroids: Tensor) -> tuple[Tensor, Tensor]:

@@ -8,6 +8,10 @@ Lloyd's iterations with three changes that reach a lower inertia in a fraction o
   clusters that gain most from a split, which leads out of the local minimum of the initialisation;
 - where there are many centroids, most iterations compare a point with those around it only; every seventh, and the
   last, with all. They end only where a search of all gains no more than one nearby.
+
+For 2048 clusters of 100,000 points (mixtures, and smooth codes, of 128 channels; one core): without the first it
+takes 2 to 23 % longer for an inertia up to 0.7 % higher, without the second the inertia is 1 to 10 % higher, without
+the third it takes 1.3 to 2.3 times as long.
 """
 
 from collections.abc import Callable
@@ -51,34 +55,24 @@ class KMeansResult(NamedTuple):
 
 
 def draw_initial(points: Tensor, num_clusters: int, generator: torch.Generator) -> Tensor:
-    """Draw initial centroids, in batches, with probability proportional to the squared distance to earlier ones.
+    """Draw (k, d) of the points, in batches, with probability proportional to the squared distance to earlier ones.
 
     This is k-means++ with batches in place of single draws, on a sample of the points. The random numbers are
     made on the CPU, so that they are the same for every device.
 
-    Args:
-        points: (N, d).
-        num_clusters: k.
-        generator: CPU generator.
-
-    Returns:
-        (k, d), a subset of the points.
-
     Source: Bahmani et al., "Scalable k-means++", VLDB 2012.
     """
-    count = points.shape[0]
-    chosen = torch.randperm(count, generator=generator)[: _SAMPLES_PER_CLUSTER * num_clusters]
+    chosen = torch.randperm(len(points), generator=generator)[: _SAMPLES_PER_CLUSTER * num_clusters]
     sample = points[chosen.to(points.device)]
-    squared_norms = torch.linalg.vector_norm(sample, dim=1).square()
     batch = -(-num_clusters // _INITIAL_BATCHES)
     drawn = [sample[:batch]]
-    _, cost, _ = find_nearest(sample, squared_norms, drawn[0])
+    _, cost, _ = find_nearest(sample, drawn[0])
     while (missing := num_clusters - sum(part.shape[0] for part in drawn)) > 0:
         # The smallest of exponential variates divided by weights: draws without replacement.
         uniform = torch.rand(sample.shape[0], generator=generator, dtype=torch.float64).clamp(min=1e-300)
         key = uniform.log().neg().to(cost) / cost
         new = sample[key.topk(min(batch, missing), largest=False).indices]
-        cost = torch.minimum(cost, find_nearest(sample, squared_norms, new)[1])
+        cost = torch.minimum(cost, find_nearest(sample, new)[1])
         drawn.append(new)
     return torch.cat(drawn)
 
@@ -228,7 +222,7 @@ def kmeans(
     generator = torch.Generator().manual_seed(seed)
     initial = draw_initial(points, num_clusters, generator)
     centroids, made = _iterate(points, initial, num_iterations, tolerance, progress)
-    assignment, _, _ = find_nearest(points, torch.linalg.vector_norm(points, dim=1).square(), centroids)
+    assignment, _, _ = find_nearest(points, centroids)
     centroids, assignment, cost = fill_empty_clusters(points, assignment, centroids)
     return KMeansResult(centroids + centre, assignment, cost.sum(dtype=_sum_dtype(cost)), made)
 
@@ -237,7 +231,6 @@ def _iterate(
     points: Tensor, centroids: Tensor, num_iterations: int, tolerance: float, progress: OnIteration | None
 ) -> tuple[Tensor, int]:
     """Centroids after at most ``num_iterations`` and the number of iterations made."""
-    squared_norms = torch.linalg.vector_norm(points, dim=1).square()
     near: Neighbourhoods | None = None
     next_search_of_all = 0
     next_move = _FIRST_MOVE
@@ -245,19 +238,18 @@ def _iterate(
     for iteration in range(num_iterations):
         final = iteration == num_iterations - 1
         moving = iteration == next_move and not final
-        of_all = near is None or iteration >= next_search_of_all or final
-        if near is None or of_all:
-            searched = points
-            index, cost, second_cost = find_nearest(points, squared_norms, centroids, moving)
-        else:
-            searched = near.points
-            index, cost, second_cost = near.find_nearest(centroids, moving)
+        if final or iteration >= next_search_of_all:
+            near = None  # makes room: it has a copy of all points
+        searched = points if near is None else near.points
+        index, cost, second_cost = (
+            find_nearest(points, centroids, moving) if near is None else near.find_nearest(centroids, moving)
+        )
         inertia = float(cost.sum(dtype=_sum_dtype(cost)))
         if progress is not None:
             progress(iteration + 1, inertia)
         means, _ = cluster_means(searched, index, centroids)
         slow = previous is not None and previous - inertia <= tolerance * previous and iteration > next_move
-        if final or (of_all and slow):
+        if final or (near is None and slow):
             return means, iteration + 1
         if moving and second_cost is not None:
             centroids, moves = relocate(searched, index, cost, second_cost, means)
@@ -267,9 +259,8 @@ def _iterate(
             continue
         centroids = means if iteration == 0 else torch.lerp(centroids, means, _RELAXATION)
         previous = inertia
-        if of_all and Neighbourhoods.worthwhile(len(means)):
-            near = None  # makes room: it has a copy of all points
-            near = Neighbourhoods.around(points, squared_norms, index, means)
+        if near is None and Neighbourhoods.worthwhile(len(means)):
+            near = Neighbourhoods.around(points, index, means)
             next_search_of_all = iteration + _ALL_EVERY
             # The next search finds the inertia a trace too high, which must not look like the end.
             previous = None

@@ -22,14 +22,12 @@ class Neighbourhoods(NamedTuple):
 
     Attributes:
         points: (N, d), those of a group one after another.
-        squared_norms: (N,) of the points.
         bounds: group g has the points ``bounds[g]`` to ``bounds[g + 1]``.
         anchors: (k, d) the centroids when the groups were made.
         groups: (k,) the group of each of them.
     """
 
     points: Tensor
-    squared_norms: Tensor
     bounds: list[int]
     anchors: Tensor
     groups: Tensor
@@ -40,12 +38,11 @@ class Neighbourhoods(NamedTuple):
         return num_centroids >= 4 * _CANDIDATES
 
     @classmethod
-    def around(cls, points: Tensor, squared_norms: Tensor, assignment: Tensor, centroids: Tensor) -> Self:
+    def around(cls, points: Tensor, assignment: Tensor, centroids: Tensor) -> Self:
         """Group points by the centroids that they are assigned to.
 
         Args:
             points: (N, d).
-            squared_norms: (N,).
             assignment: (N,) nearest centroids.
             centroids: (k, d), k a few times the number of centroids in a neighbourhood.
         """
@@ -53,7 +50,7 @@ class Neighbourhoods(NamedTuple):
         of_points, order = groups[assignment].sort(stable=True)
         numbers = torch.arange(int(groups.max()) + 2, device=points.device)
         bounds = torch.searchsorted(of_points, numbers).tolist()
-        return cls(points[order], squared_norms[order], bounds, centroids, groups)
+        return cls(points[order], bounds, centroids, groups)
 
     def find_nearest(
         self, centroids: Tensor, with_second: bool = False
@@ -67,14 +64,12 @@ class Neighbourhoods(NamedTuple):
         Returns:
             As :func:`foundpose.clustering.assignment.find_nearest`, for the points in this order.
         """
-        index = torch.empty(len(self.points), dtype=torch.int64, device=centroids.device)
-        cost = torch.empty_like(self.squared_norms)
+        index = self.points.new_empty(len(self.points), dtype=torch.int64)
+        cost = self.points.new_empty(len(self.points))
         second_cost = torch.empty_like(cost) if with_second else None
         for group, candidates in enumerate(self._candidates(centroids)):
             members = slice(self.bounds[group], self.bounds[group + 1])
-            found = find_nearest(
-                self.points[members], self.squared_norms[members], centroids[candidates], with_second
-            )
+            found = find_nearest(self.points[members], centroids[candidates], with_second)
             index[members], cost[members] = candidates[found[0]], found[1]
             if second_cost is not None and found[2] is not None:
                 second_cost[members] = found[2]
@@ -90,8 +85,7 @@ class Neighbourhoods(NamedTuple):
 
 def _group(centroids: Tensor) -> Tensor:
     """(k,) groups of about 32 centroids that lie close together."""
-    squared_norms = centroids.square().sum(dim=1)
     hearts = centroids[::_HEART]
     for _ in range(_ITERATIONS):
-        hearts, _ = cluster_means(centroids, find_nearest(centroids, squared_norms, hearts)[0], hearts)
-    return find_nearest(centroids, squared_norms, hearts)[0]
+        hearts, _ = cluster_means(centroids, find_nearest(centroids, hearts)[0], hearts)
+    return find_nearest(centroids, hearts)[0]

@@ -17,7 +17,7 @@ from torch import Tensor
 from foundpose.utils.files import write_atomically
 from foundpose.utils.settings import digest
 
-ARTEFACT_VERSION = 1
+ARTEFACT_VERSION = 2
 
 _T = TypeVar("_T")
 

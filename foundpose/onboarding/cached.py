@@ -1,6 +1,6 @@
 """Onboarding with files between its stages, so that a changed setting redoes only what depends on it."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
@@ -113,14 +113,12 @@ class CachedOnboarding:
             return cameras._asdict() | packed._asdict()
 
         tensors = self._get("renderings", mesh, make)
-        return TemplateCameras(*_pick(tensors, TemplateCameras._fields)), PackedPictures(
-            *_pick(tensors, PackedPictures._fields)
-        )
+        return _cameras(tensors), PackedPictures(*(tensors[name] for name in PackedPictures._fields))
 
-    def _unpack(self, packed: PackedPictures, rows: slice) -> tuple[Tensor, Tensor]:
+    def _unpack(self, packed: PackedPictures, rows: slice) -> TemplatePictures:
         """Pictures and masks of some templates."""
         size = (self.onboarder.image_size, self.onboarder.image_size)
-        return unpack_pictures(packed, rows, size, self.onboarder.renderer.bits)
+        return TemplatePictures(*unpack_pictures(packed, rows, size, self.onboarder.renderer.bits))
 
     def _patches(self, mesh: Mesh, report: Progress) -> tuple[TemplateCameras, PatchTable]:
         """Cameras of all templates and their valid patches."""
@@ -130,7 +128,7 @@ class CachedOnboarding:
             cameras, packed = self._renderings(mesh, report)
 
             def prepare(batch: TemplateCameras, rows: slice) -> PatchTable:
-                return onboarder.register(mesh, batch, self._unpack(packed, rows)[1])
+                return onboarder.register(mesh, batch, self._unpack(packed, rows).masks)
 
             with onboarder.batches(cameras, prepare, "patches", report) as batches:
                 tables = [table for table, _ in batches]
@@ -138,9 +136,7 @@ class CachedOnboarding:
             return cameras._asdict() | table._asdict()
 
         tensors = self._get("patches", mesh, make)
-        return TemplateCameras(*_pick(tensors, TemplateCameras._fields)), PatchTable(
-            *_pick(tensors, PatchTable._fields)
-        )
+        return _cameras(tensors), PatchTable(*(tensors[name] for name in PatchTable._fields))
 
     def _descriptors(self, mesh: Mesh, report: Progress) -> tuple[list[Tensor], Tensor]:
         """Descriptors of all templates, and their global ones."""
@@ -158,7 +154,7 @@ class CachedOnboarding:
                 table = PatchTable(
                     patches.points_model[of_batch], patches.patch_index[of_batch], counts[rows]
                 )
-                levels = self._unpack(packed, rows)[0]
+                levels = self._unpack(packed, rows).levels
                 return pin(levels, device), PatchTable(*(pin(part, device) for part in table))
 
             # Filled batch by batch: joining a list would take the memory twice.
@@ -198,6 +194,5 @@ class CachedOnboarding:
         return FittedWords(projection, tensors["words"], tensors["descriptors"]), tensors["template_cls"]
 
 
-def _pick(tensors: Mapping[str, Tensor], names: Iterable[str]) -> list[Tensor]:
-    """Tensors of some names, in that order."""
-    return [tensors[name] for name in names]
+def _cameras(tensors: Mapping[str, Tensor]) -> TemplateCameras:
+    return TemplateCameras(*(tensors[name] for name in TemplateCameras._fields))

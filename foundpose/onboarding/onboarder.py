@@ -26,7 +26,7 @@ from foundpose.onboarding.stages import (
 )
 from foundpose.onboarding.templates import TemplateCameras, register_patches, template_cameras
 from foundpose.rendering import Mesh, Renderer
-from foundpose.representation.object_representation import ObjectRepresentation, RepresentationInfo
+from foundpose.representation import ObjectRepresentation, RepresentationInfo
 from foundpose.representation.quantization import Storage, check_storage
 from foundpose.retrieval import IdfMode, SoftAssignBow, VisualWords
 from foundpose.utils.batch_size import BatchSize, check_batch_size, measure_batch_size
@@ -260,10 +260,8 @@ class Onboarder(nn.Module):
             patches: of the pictures, on the CPU.
         """
         template = torch.arange(len(levels)).repeat_interleave(patches.counts)
-        template, cells = (
-            upload(pin(template, self.device), self.device),
-            upload(patches.patch_index, self.device),
-        )
+        template = upload(pin(template, self.device), self.device)
+        cells = upload(patches.patch_index, self.device)
         features = self.extractor(dequantize(upload(levels, self.device), self.renderer.bits))
         descriptors = features.patches.flatten(2).transpose(1, 2)[template, cells].float()
         cls = descriptors.new_empty(len(levels), 0) if features.cls is None else features.cls.float()

@@ -7,7 +7,8 @@ from foundpose.onboarding.cached import CachedOnboarding
 from foundpose.onboarding.onboarder import Onboarder
 from foundpose.onboarding.stages import Progress
 from foundpose.rendering import Mesh
-from foundpose.representation.object_representation import SCHEMA_VERSION, ObjectRepresentation
+from foundpose.representation import ObjectRepresentation
+from foundpose.representation.info import SCHEMA_VERSION
 from foundpose.utils.settings import digest
 
 

@@ -1,18 +1,13 @@
 """What is known of an object, and how it is stored."""
 
 from foundpose.representation.groups import ObjectGroups, take_rows
-from foundpose.representation.object_representation import (
-    ObjectRepresentation,
-    RepresentationInfo,
-    TemplatePatches,
-    read_info,
-)
+from foundpose.representation.info import RepresentationInfo
+from foundpose.representation.object_representation import ObjectRepresentation, TemplatePatches
 
 __all__ = [
     "ObjectGroups",
     "ObjectRepresentation",
     "RepresentationInfo",
     "TemplatePatches",
-    "read_info",
     "take_rows",
 ]

@@ -1,75 +1,25 @@
 """What is kept of an object after onboarding."""
 
-import json
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import NamedTuple, Self
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from foundpose.features.base import Fingerprint, PatchExtractor
 from foundpose.features.pca import PcaProjection
-from foundpose.geometry.patch_grid import PatchGrid
+from foundpose.representation.info import SCHEMA_VERSION, RepresentationInfo
 from foundpose.representation.quantization import DescriptorCodec, Storage, codec_from_state, compress
-from foundpose.utils.files import write_atomically
+from foundpose.utils.files import read_weights, save_weights
 
-SCHEMA_VERSION = 1
-
-
-@dataclass(frozen=True)
-class RepresentationInfo:
-    """Facts about a representation that are not tensors.
-
-    Attributes:
-        name: the object's name.
-        diameter: largest distance between two mesh vertices, mesh units.
-        mesh_checksum: checksum of the mesh that was onboarded.
-        extractor: fingerprint of the extractor that made the descriptors.
-        image_size: side of a template in pixels.
-        stride: distance of patch centres in pixels.
-        offset: coordinate of the first patch centre in pixels.
-        grid: number of patches along a side.
-        settings: further settings of the onboarding, for the record.
-        schema_version: version of the file format.
-        scales: of the descriptors, by name, see :class:`foundpose.onboarding.scales.DescriptorScales`; those that the
-            templates do not show are left out.
-    """
-
-    name: str
-    diameter: float
-    mesh_checksum: str
-    extractor: Fingerprint
-    image_size: int
-    stride: float
-    offset: float
-    grid: int
-    settings: dict[str, str | int | float | bool | None] = field(default_factory=dict)
-    schema_version: int = SCHEMA_VERSION
-    scales: dict[str, float] = field(default_factory=dict)
-
-    @property
-    def patch_grid(self) -> PatchGrid:
-        """Where the patches of the templates lie."""
-        return PatchGrid(self.stride, self.offset, self.grid)
-
-    def scale(self, name: str, setting: str) -> float:
-        """A scale of the descriptors, for a setting that is "auto".
-
-        Raises:
-            ValueError: it was not measured; the message says which setting to set.
-        """
-        if name not in self.scales:
-            raise ValueError(
-                f"{setting} is auto, but the representation of {self.name!r} has no measured scale {name!r}: "
-                f"onboard the "
-                f"object again, with more templates if there were few, or set {setting} to a number"
-            )
-        return self.scales[name]
+_HEADER = "foundpose"
+_TENSORS = (
+    *("words", "idf", "template_bow", "descriptors", "points_model", "patch_index", "template_offsets"),
+    *("T_template_from_model", "K_template"),
+)
 
 
 class TemplatePatches(NamedTuple):
@@ -236,21 +186,9 @@ class ObjectRepresentation(nn.Module):
             )
         descriptors, codec = compress(self.descriptors, storage, subspaces)
         facts = {"storage": storage} | ({"pq_subspaces": subspaces} if storage == "pq" else {})
-        return type(self)(
-            self.projection,
-            self.words,
-            self.idf,
-            self.template_bow,
-            descriptors,
-            self.points_model,
-            self.patch_index,
-            self.template_offsets,
-            self.T_template_from_model,
-            self.K_template,
-            self.template_cls,
-            replace(self.info, settings=self.info.settings | facts),
-            codec,
-        )
+        tensors = dict(self.named_buffers(recurse=False)) | {"descriptors": descriptors}
+        info = replace(self.info, settings=self.info.settings | facts)
+        return self._of(self.projection, tensors, info, codec)
 
     def memory_bytes(self) -> dict[str, int]:
         """Bytes taken by each part, and their ``total``.
@@ -287,10 +225,7 @@ class ObjectRepresentation(nn.Module):
 
     def save(self, path: str | Path) -> None:
         """Write one safetensors file whose header holds the facts as JSON. Atomic."""
-        # Contiguous copies: safetensors refuses views that share memory.
-        tensors = {name: t.detach().cpu().contiguous() for name, t in self.state_dict().items()}
-        metadata = {"foundpose": json.dumps(asdict(self.info), sort_keys=True)}
-        write_atomically(Path(path), lambda temporary: save_file(tensors, str(temporary), metadata=metadata))
+        save_weights(Path(path), self, _HEADER, asdict(self.info))
 
     @classmethod
     def load(
@@ -318,62 +253,32 @@ class ObjectRepresentation(nn.Module):
             FileNotFoundError: no such file.
             ValueError: not a representation, of another schema version, or made with another extractor.
         """
-        path = Path(path)
-        info = read_info(path)
-        with safe_open(str(path), framework="pt", device=str(device)) as file:
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
-        if not mmap:
-            tensors = {name: tensor.clone() for name, tensor in tensors.items()}
+        facts, tensors = read_weights(
+            Path(path), _HEADER, SCHEMA_VERSION, "object representation", "onboard the object first"
+        )
+        # On the CPU, a tensor of the file is a view of it.
+        tensors = {name: (tensor if mmap else tensor.clone()).to(device) for name, tensor in tensors.items()}
         try:
             codec = codec_from_state(_part(tensors, "codec."))
-            representation = cls(
-                projection=_load_projection(tensors),
-                words=_take(tensors, "words"),
-                idf=_take(tensors, "idf"),
-                template_bow=_take(tensors, "template_bow"),
-                descriptors=_take(tensors, "descriptors"),
-                points_model=_take(tensors, "points_model"),
-                patch_index=_take(tensors, "patch_index"),
-                template_offsets=_take(tensors, "template_offsets"),
-                T_template_from_model=_take(tensors, "T_template_from_model"),
-                K_template=_take(tensors, "K_template"),
-                template_cls=tensors.get("template_cls"),
-                info=info,
-                codec=codec,
-            )
+            representation = cls._of(_load_projection(tensors), tensors, RepresentationInfo(**facts), codec)
         except ValueError as error:
             raise ValueError(f"{path}: {error}; onboard the object again") from error
         if extractor is not None:
             representation.check_extractor(extractor.fingerprint())
         return representation
 
-
-def read_info(path: str | Path) -> RepresentationInfo:
-    """Read the facts of a representation's file without its tensors.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: not a representation, or one of another schema version.
-    """
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"no object representation at {path}; onboard the object first")
-    try:
-        with safe_open(str(path), framework="pt") as file:
-            metadata = file.metadata() or {}
-    except SafetensorError as error:
-        raise ValueError(
-            f"{path} is not a readable safetensors file ({error}); onboard the object again"
-        ) from error
-    if "foundpose" not in metadata:
-        raise ValueError(f"{path} holds no object representation (no 'foundpose' entry in its header)")
-    facts = json.loads(metadata["foundpose"])
-    version = facts.get("schema_version")
-    if version != SCHEMA_VERSION:
-        raise ValueError(
-            f"{path} has schema version {version}, this library reads {SCHEMA_VERSION}; onboard the object again"
-        )
-    return RepresentationInfo(**facts)
+    @classmethod
+    def _of(
+        cls,
+        projection: PcaProjection,
+        tensors: Mapping[str, Tensor],
+        info: RepresentationInfo,
+        codec: DescriptorCodec | None,
+    ) -> Self:
+        """The representation with some buffers, by name."""
+        named = {name: _take(tensors, name) for name in _TENSORS}
+        cls_tokens = tensors.get("template_cls")
+        return cls(projection=projection, **named, template_cls=cls_tokens, info=info, codec=codec)
 
 
 def _take(tensors: Mapping[str, Tensor], name: str) -> Tensor:

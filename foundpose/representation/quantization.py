@@ -244,8 +244,7 @@ def codec_from_state(state: Mapping[str, Tensor]) -> DescriptorCodec | None:
     """
     if not state:
         return None
-    for codec in (ScalarCodec, ProductCodec):
-        names = ("scale", "offset") if codec is ScalarCodec else ("centroids", "channels")
+    for codec, names in ((ScalarCodec, ("scale", "offset")), (ProductCodec, ("centroids", "channels"))):
         if set(state) == set(names):
             return codec(*(state[name] for name in names))
     raise ValueError(f"no descriptor codec consists of {sorted(state)}")

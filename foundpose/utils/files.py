@@ -99,13 +99,13 @@ def read_weights(
             metadata = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
     except SafetensorError as error:
-        raise ValueError(f"{path} is not a readable safetensors file ({error})") from error
+        raise ValueError(f"{path} is not a readable safetensors file ({error}); {hint}") from error
     if header not in metadata:
-        raise ValueError(f"{path} holds no {what} (no {header!r} entry in its header)")
+        raise ValueError(f"{path} holds no {what} (no {header!r} entry in its header); {hint}")
     facts = json.loads(metadata[header])
     version = facts.pop("schema_version", None)
     if version != schema_version:
-        raise ValueError(f"{path} has schema version {version}, this library reads {schema_version}")
+        raise ValueError(f"{path} has schema version {version}, this library reads {schema_version}; {hint}")
     return facts, tensors
 
 

@@ -91,7 +91,7 @@ def test_find_nearest_equals_brute_force(monkeypatch: pytest.MonkeyPatch) -> Non
     expected = exact_costs(x, c).topk(2, dim=1, largest=False)
     for budget in (1 << 21, 192 * 7):
         monkeypatch.setattr(assignment_module, "_CPU_SCORES_PER_BLOCK", budget)
-        index, cost, second = find_nearest(x, x.square().sum(1), c, with_second=True)
+        index, cost, second = find_nearest(x, c, with_second=True)
         assert torch.equal(index, expected.indices[:, 0])
         torch.testing.assert_close(cost, expected.values[:, 0])
         torch.testing.assert_close(second, expected.values[:, 1])
@@ -138,9 +138,8 @@ def test_searching_neighbourhoods_does_not_change_the_outcome(
 
 def test_neighbourhoods_hold_all_points_and_search_what_is_near() -> None:
     x, centroids = mixture(4000, 8, 500, 0.6).double(), mixture(1030, 8, 500, 0.6, seed=1).double()
-    norms = x.square().sum(1)
-    assignment, _, _ = find_nearest(x, norms, centroids)
-    near = Neighbourhoods.around(x, norms, assignment, centroids)
+    assignment, _, _ = find_nearest(x, centroids)
+    near = Neighbourhoods.around(x, assignment, centroids)
     assert torch.equal(near.points.sort(dim=0).values, x.sort(dim=0).values)
     assert near.bounds[0] == 0
     assert near.bounds[-1] == len(x)
@@ -195,7 +194,7 @@ def test_relocation_lowers_the_cost() -> None:
     far = torch.arange(20.0)[:, None] * 1000 + 5000
     x = torch.cat([x, (far + torch.zeros(20, 2)).repeat(2, 1)])
     x, centroids = x.double(), torch.cat([centroids, far + torch.zeros(20, 2)]).double()
-    index, cost, second = find_nearest(x, x.square().sum(1), centroids, with_second=True)
+    index, cost, second = find_nearest(x, centroids, with_second=True)
     assert second is not None
     means, _ = cluster_means(x, index, centroids)
     moved, moves = relocate(x, index, cost, second, means)

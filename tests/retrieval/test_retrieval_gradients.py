@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.autograd import gradcheck
 
 from foundpose.features import PcaProjection
-from foundpose.representation.object_representation import ObjectRepresentation, RepresentationInfo
+from foundpose.representation import ObjectRepresentation, RepresentationInfo
 from foundpose.retrieval.base import QueryPatches
 from foundpose.retrieval.bow import (
     SoftAssignBow,

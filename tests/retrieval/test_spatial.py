@@ -2,8 +2,7 @@ import pytest
 import torch
 
 from foundpose.features.pca import CovarianceAccumulator, PcaProjection
-from foundpose.representation import ObjectRepresentation
-from foundpose.representation.object_representation import RepresentationInfo
+from foundpose.representation import ObjectRepresentation, RepresentationInfo
 from foundpose.retrieval import QueryPatches, SoftAssignBow, SpatialReranker, TemplateRetriever
 from foundpose.retrieval.base import RetrievedTemplates, Retriever
 

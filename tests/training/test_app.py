@@ -173,11 +173,13 @@ def test_train_resume_and_refuse(monkeypatch, tmp_path, capsys, bodies):
 
     # One more epoch goes on where the first one ended; what was measured before is not measured again.
     before = (run / "before.safetensors").stat().st_mtime_ns
-    pairs = {path: path.stat().st_mtime_ns for path in (run / "pairs").iterdir()}
+    pairs = {path: path.stat().st_mtime_ns for path in (run / "artefacts").glob("pairs/*.safetensors")}
     assert len(pairs) == 2
     again = run_app(monkeypatch, tmp_path, info, cup, "trainer.max_epochs=2")
     assert (run / "before.safetensors").stat().st_mtime_ns == before
-    assert {path: path.stat().st_mtime_ns for path in (run / "pairs").iterdir()} == pairs
+    assert {
+        path: path.stat().st_mtime_ns for path in (run / "artefacts").glob("pairs/*.safetensors")
+    } == pairs
     assert again["results"]["nearest"]["before"] == facts["results"]["nearest"]["before"]
     checkpoint = torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)
     assert checkpoint["epoch"] == 1

@@ -21,8 +21,16 @@ from foundpose.geometry import (
     symmetries_from_models_info,
     transform_points,
 )
+from foundpose.onboarding import ArtefactStore
 from foundpose.synthetic import LightVariation, cluttered_scene, procedural_mesh
-from foundpose.training import EpochShuffle, PairSettings, make_pairs, nearby_rotations, render_crops
+from foundpose.training import (
+    EpochShuffle,
+    PairDataModule,
+    PairSettings,
+    make_pairs,
+    nearby_rotations,
+    render_crops,
+)
 
 
 def test_importing_the_library_does_not_import_lightning():
@@ -137,12 +145,12 @@ def test_pairs_follow_the_seed_alone(pairs, bodies, sift_onboarder, crop, settin
 
 def test_cache(bodies, sift_onboarder, crop, settings, tmp_path, monkeypatch):
     few = dataclasses.replace(settings, crops_per_mesh=2)
-    steps = []
+    steps, cache = [], ArtefactStore(tmp_path)
 
     def make(onboarder=sift_onboarder, seed=0):
         steps.clear()
         return make_pairs(
-            bodies[:1], onboarder, crop, few, seed, tmp_path, lambda stage, done, total: steps.append(done)
+            bodies[:1], onboarder, crop, few, seed, cache, lambda stage, done, total: steps.append(done)
         )
 
     first = make()
@@ -158,11 +166,11 @@ def test_cache(bodies, sift_onboarder, crop, settings, tmp_path, monkeypatch):
     make(other)
     assert steps == [2]
     black = PerspectiveCrop(crop.size, crop.fill, background="black")
-    make_pairs(bodies[:1], sift_onboarder, black, few, 0, tmp_path)
+    make_pairs(bodies[:1], sift_onboarder, black, few, 0, cache)
     monkeypatch.setattr(type(sift_onboarder.extractor), "running_precision", lambda _: "bf16")
     make()
     assert steps == [2]
-    assert len(list(tmp_path.iterdir())) == 5
+    assert len(cache.entries()) == 5
 
 
 def test_symmetries_go_with_their_objects(bodies, sift_onboarder, crop, settings, tmp_path):
@@ -171,12 +179,14 @@ def test_symmetries_go_with_their_objects(bodies, sift_onboarder, crop, settings
     both = stack_symmetries([spin, symmetries_from_models_info({})])
 
     def make(symmetries):
-        return make_pairs(bodies, sift_onboarder, crop, few, 0, tmp_path, symmetries=symmetries)
+        data = PairDataModule(bodies, [], sift_onboarder, crop, few, cache=tmp_path, symmetries=symmetries)
+        data.setup()
+        return data.training
 
     assert make(None)[0].symmetries is None
     found = make(both)
     # They change no picture.
-    assert len(list(tmp_path.iterdir())) == 1
+    assert len(ArtefactStore(tmp_path).entries()) == 1
     batch = found.__getitems__([1, 0, 1])
     assert batch.symmetries.axis_valid.tolist() == [[False], [True], [False]]
     assert batch.symmetries.origins[1].tolist() == [[1.0, 2.0, 3.0]]

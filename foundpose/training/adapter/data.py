@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from foundpose.geometry import PerspectiveCrop, Symmetries
-from foundpose.onboarding import Onboarder, Progress
+from foundpose.onboarding import ArtefactStore, Onboarder, Progress
 from foundpose.rendering import Mesh
 from foundpose.training.adapter.pairs import PairSettings, PatchPairs, make_pairs
 from foundpose.training.base import RenderedDataModule
@@ -48,20 +48,17 @@ class PairDataModule(RenderedDataModule):
         self.onboarder = onboarder
         self.crop = crop
         self.pairs = pairs
-        self.cache = None if cache is None else Path(cache)
+        self.cache = None if cache is None else ArtefactStore(cache)
         self.progress = progress
         self.symmetries = symmetries
         self.validation_symmetries = validation_symmetries
 
     def render(self, validation: bool) -> PatchPairs:
         """Make the pairs."""
-        return make_pairs(
-            self.validation_meshes if validation else self.meshes,
-            self.onboarder,
-            self.crop,
-            self.pairs,
-            self.seed + validation,
-            self.cache,
-            self.progress,
-            self.validation_symmetries if validation else self.symmetries,
-        )
+        meshes = self.validation_meshes if validation else self.meshes
+        symmetries = self.validation_symmetries if validation else self.symmetries
+        if symmetries is not None:
+            symmetries.check(len(meshes), symmetries.transforms)  # now, not after hours of rendering
+        seed = self.seed + validation
+        found = make_pairs(meshes, self.onboarder, self.crop, self.pairs, seed, self.cache, self.progress)
+        return PatchPairs(found.tensors, symmetries)

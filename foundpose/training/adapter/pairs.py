@@ -1,24 +1,19 @@
 """Pairs of a crop and a template near it, described once and kept."""
 
-import hashlib
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from foundpose.features import PatchFeatures
 from foundpose.geometry import PerspectiveCrop, Symmetries
-from foundpose.onboarding import Onboarder, Progress
+from foundpose.onboarding import ArtefactStore, Onboarder, Progress
 from foundpose.pipeline import select_query_patches
 from foundpose.rendering import Mesh
 from foundpose.synthetic import LightVariation, combine_seeds
 from foundpose.training.views import nearby_rotations, render_crops, render_templates
-from foundpose.utils.files import write_atomically
 from foundpose.utils.settings import identity
 
 
@@ -99,10 +94,16 @@ class PatchPairs(torch.utils.data.Dataset[PairBatch]):
             ``template_offsets`` cut them apart; ``query_of`` (N,) is the crop and ``mesh_of`` (N,) the mesh of each
             pair, ``K_crop`` and ``T_crop_from_model`` are those of the crops, ``surface`` and ``diameter`` of the
             meshes. Pair n owns template n.
-        symmetries: of the meshes, one entry each; None: they have none.
+        symmetries: of the meshes, one entry each (:func:`foundpose.geometry.stack_symmetries`); None: they have none.
+
+    Raises:
+        ValueError: symmetries of another number of objects.
     """
 
     def __init__(self, tensors: dict[str, Tensor], symmetries: Symmetries | None = None) -> None:
+        if symmetries is not None:
+            symmetries = symmetries.to("cpu", torch.float32)
+            symmetries.check(len(tensors["surface"]), tensors["surface"])
         self.tensors = tensors
         self.symmetries = symmetries
 
@@ -141,11 +142,10 @@ def make_pairs(
     crop: PerspectiveCrop,
     settings: PairSettings,
     seed: int,
-    cache: Path | None = None,
+    cache: ArtefactStore | None = None,
     progress: Progress | None = None,
-    symmetries: Symmetries | None = None,
 ) -> PatchPairs:
-    """Render and describe pairs, or read them from the cache.
+    """Render and describe pairs of objects without symmetries, or read them from the cache.
 
     Args:
         meshes: the objects; object i's scenes differ from those of object j.
@@ -153,13 +153,12 @@ def make_pairs(
         crop: cuts the crops.
         settings: what the pairs are made of.
         seed: of everything that is random.
-        cache: folder to keep the pairs in; other settings, meshes or weights get another file.
+        cache: keeps the pairs; other settings, meshes or weights get another file. Symmetries change no picture:
+            ``PatchPairs(make_pairs(…).tensors, symmetries)`` has them.
         progress: is told of every crop.
-        symmetries: of the meshes, one entry each (:func:`foundpose.geometry.stack_symmetries`); None: they have none.
-            They change no picture, so the cache does not depend on them.
 
     Raises:
-        ValueError: no meshes, crop and templates of different sizes, or symmetries of another number of objects.
+        ValueError: no meshes, or crop and templates of different sizes.
     """
     if not meshes:
         raise ValueError("meshes is empty: give at least one to make pairs of")
@@ -167,30 +166,21 @@ def make_pairs(
         raise ValueError(
             f"crops are {crop.size} px wide, templates {onboarder.image_size} px; use one size for both"
         )
-    if symmetries is not None:
-        symmetries = symmetries.to("cpu", torch.float32)
-        symmetries.check(len(meshes), meshes[0].vertices)
-    path = None
-    if cache is not None:
-        facts = {
-            "format": 2,
-            "meshes": [mesh.checksum for mesh in meshes],
-            "extractor": onboarder.extractor.fingerprint(),
-            "templates": [onboarder.image_size, onboarder.fill, onboarder.distance, onboarder.mask_erosion],
-            "precision": onboarder.extractor.running_precision(),
-            "renderer": identity(onboarder.renderer),
-            "crop": crop.settings(),
-            "pairs": asdict(settings),
-            "seed": seed,
-        }
-        text = json.dumps(facts, sort_keys=True, default=list)
-        path = cache / f"pairs-{hashlib.sha256(text.encode()).hexdigest()[:12]}.safetensors"
-        if path.is_file():
-            return PatchPairs(load_file(path), symmetries)
-    tensors = _describe(meshes, onboarder, crop, settings, seed, progress)
-    if path is not None:
-        write_atomically(path, lambda temporary: save_file(tensors, str(temporary)))
-    return PatchPairs(tensors, symmetries)
+    facts = {
+        "meshes": [mesh.checksum for mesh in meshes],
+        "extractor": onboarder.extractor.fingerprint(),
+        "precision": onboarder.extractor.running_precision(),
+        "templates": [onboarder.image_size, onboarder.fill, onboarder.distance, onboarder.mask_erosion],
+        "renderer": identity(onboarder.renderer),
+        "crop": identity(crop),
+        "pairs": asdict(settings),
+        "seed": seed,
+    }
+
+    def make() -> dict[str, Tensor]:
+        return _describe(meshes, onboarder, crop, settings, seed, progress)
+
+    return PatchPairs(make() if cache is None else cache.get("pairs", facts, make))
 
 
 @torch.no_grad()  # the descriptors are data; what is trained comes after them
