@@ -37,6 +37,7 @@ INLINE = ["crop", "projection", "words", "start"]  # of config.yaml
 SIZES = "hidden_size: 24, num_attention_heads: 2, num_hidden_layers: 1"
 SMALL = {
     "dinov2": [f"extractor.config={{{SIZES}}}", "extractor.layer=null"],
+    "dino": [f"extractor.config={{{SIZES}, intermediate_size: 24}}"],
     "dinov3": [f"extractor.config={{{SIZES}, intermediate_size: 24}}"],
     "clip": [f"extractor.config={{{SIZES}, intermediate_size: 24}}"],
     "sam": [f"extractor.config={{{SIZES}, mlp_dim: 24, global_attn_indexes: [0]}}"],

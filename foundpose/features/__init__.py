@@ -6,6 +6,7 @@ Nothing here imports transformers before an extractor that needs it is construct
 from foundpose.features.adapter import AdaptedExtractor, ResidualAdapter
 from foundpose.features.base import Fingerprint, PatchExtractor, PatchFeatures
 from foundpose.features.dense_sift import DenseSift
+from foundpose.features.dino import Dino
 from foundpose.features.dinov2 import DinoV2
 from foundpose.features.hook import FeatureHook
 from foundpose.features.loftr import LoftrBackbone
@@ -20,6 +21,7 @@ __all__ = [
     "Clip",
     "CoordinateCode",
     "DenseSift",
+    "Dino",
     "DinoV2",
     "DinoV3",
     "FeatureHook",

@@ -112,7 +112,8 @@ class PretrainedExtractor(PatchExtractor):
             cls = images.new_zeros(0, self.channels) if self.has_cls else None
             return PatchFeatures(images.new_zeros(0, self.channels, n, n), cls)
         # resized and normalised in at least single precision
-        pixels = images.to(torch.promote_types(images.dtype, self.mean.dtype))
+        dtype = torch.promote_types(torch.promote_types(images.dtype, self.mean.dtype), torch.float32)
+        pixels = images.to(dtype)
         pixels = (resize_images(pixels, self.input_size(size)) - self.mean) / self.std
         pixels = pixels.to(next(self.model.parameters()).dtype)
         autocast = autocast_dtype(self.precision, images.device)

@@ -167,9 +167,11 @@ def build_transformers(
             ignore_mismatched_sizes=True,  # named below
         )
     # The blocks behind the hooked layer are left unread on purpose; nothing that was built may stay unread.
-    if info["missing_keys"] or info["mismatched_keys"]:
+    # A pooling layer behind them plays no part.
+    missing = sorted(key for key in info["missing_keys"] if not key.startswith("pooler."))
+    if missing or info["mismatched_keys"]:
         raise ValueError(
-            f"the weights in {origin} are incomplete: missing {sorted(info['missing_keys'])[:5]}, "
+            f"the weights in {origin} are incomplete: missing {missing[:5]}, "
             f"of the wrong shape {sorted(info['mismatched_keys'])[:5]}"
         )
     return model

@@ -4,7 +4,7 @@ from typing import Any
 
 import torch
 
-from foundpose.features import Clip, DinoV3, LoftrBackbone, S2DNet, Sam
+from foundpose.features import Clip, Dino, DinoV3, LoftrBackbone, S2DNet, Sam
 from foundpose.features.pretrained import PretrainedExtractor
 
 SIZES = {"hidden_size": 32, "num_hidden_layers": 4, "num_attention_heads": 4}
@@ -23,6 +23,8 @@ def make(name: str, seed: int | None = 0, weights: Any = "random", **kwargs: Any
             return Clip(**{"layer": 2, "config": {**CLIP, "image_size": 42}, **settings, **kwargs})
         case "clip16":
             return Clip(**{"variant": "vitb16", "layer": 2, "config": CLIP, **settings, **kwargs})
+        case "dino":
+            return Dino(**{"layer": 2, "config": CLIP, **settings, **kwargs})
         case "sam":
             return Sam(**{"layer": 2, "config": SAM, **settings, **kwargs})
         case "loftr" | "loftr_fine":
@@ -34,7 +36,7 @@ def make(name: str, seed: int | None = 0, weights: Any = "random", **kwargs: Any
     raise KeyError(name)
 
 
-TRANSFORMERS = ["dinov3", "clip", "clip16", "sam"]
+TRANSFORMERS = ["dino", "dinov3", "clip", "clip16", "sam"]
 ALL = [*TRANSFORMERS, "loftr", "loftr_fine", "s2dnet", "s2dnet_all"]
 
 

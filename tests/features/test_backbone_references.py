@@ -40,6 +40,26 @@ def test_dinov3_is_a_hidden_state_of_the_whole_model(layer: int, final_norm: boo
 
 
 @pytest.mark.parametrize("layer", [0, 2, 3])
+@pytest.mark.parametrize("final_norm", [True, False])
+def test_dino_is_a_hidden_state_of_the_whole_model(layer: int, final_norm: bool, images, tmp_path) -> None:
+    from transformers import ViTModel
+
+    shake(make("dino", layer=3)).model.save_pretrained(tmp_path)
+    whole = ViTModel.from_pretrained(tmp_path, attn_implementation="eager", add_pooling_layer=False).eval()
+    with torch.no_grad():
+        pixels = resized(images, 32, IMAGENET)
+        tokens = whole(pixels, interpolate_pos_encoding=True, output_hidden_states=True).hidden_states[
+            layer + 1
+        ]
+        if final_norm:
+            tokens = whole.layernorm(tokens)
+        out = make("dino", None, tmp_path, layer=layer, final_norm=final_norm)(images)
+    torch.testing.assert_close(out.cls, tokens[:, 0], atol=2e-5, rtol=1e-4)
+    expected = tokens[:, 1:].unflatten(1, (4, 4)).permute(0, 3, 1, 2)
+    torch.testing.assert_close(out.patches, expected, atol=2e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("layer", [0, 2, 3])
 @pytest.mark.parametrize(("name", "size"), [("clip", 56), ("clip16", 64)])
 def test_clip_is_a_hidden_state_of_the_whole_model(
     layer: int, name: str, size: int, images, tmp_path

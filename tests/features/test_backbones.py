@@ -31,7 +31,7 @@ def test_shapes_and_dtypes(name: str, dtype: torch.dtype, images) -> None:
     with torch.no_grad():
         out = extractor(images.to(dtype))
         empty = extractor(images[:0].to(dtype))
-    has_cls = name in ("dinov3", "clip", "clip16")
+    has_cls = name in ("dino", "dinov3", "clip", "clip16")
     assert out.patches.shape == (3, channels, side, side)
     assert empty.patches.shape == (0, channels, side, side)
     assert out.patches.dtype == dtype
