@@ -26,8 +26,8 @@ class Dino(VisionTransformer):
     """Patch descriptors from a layer of DINO.
 
     Variants: ``vits8`` (the default), ``vits16``, ``vitb8``, ``vitb16``. Crops of 420 px become 240 px for 8 px
-    patches and 480 px for 16 px; the position embeddings are resampled to the grid (bicubic). The default layer is the
-    last; the final LayerNorm is applied by default. Arguments: see :class:`VisionTransformer`.
+    patches and 480 px for 16 px; the position embeddings are resampled to the grid (bicubic). The default layer is
+    the last; the final LayerNorm is applied by default. Arguments: see :class:`VisionTransformer`.
 
     Source: Caron et al., "Emerging Properties in Self-Supervised Vision Transformers", ICCV 2021 (sizes: table 1); as
     the backbone of a pose estimator: Ausserlechner et al., "ZS6D", ICRA 2024.
