@@ -51,7 +51,9 @@ def stirred(head="pose", views=4):
     network = MegaPoseNetwork(head, views, width=4, seed=0).eval()
     last = network.pose_fc if head == "pose" else network.views_logits_head
     with torch.no_grad():
-        last.weight.normal_(0.0, 0.02, generator=torch.Generator().manual_seed(1))
+        last.weight.normal_(
+            0.0, 0.002 if head == "pose" else 0.02, generator=torch.Generator().manual_seed(1)
+        )
     return network
 
 
