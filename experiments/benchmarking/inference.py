@@ -12,7 +12,7 @@ from benchmarking.tasks import Task
 from benchmarking.workload import Workload, ellipsoid_mesh
 from foundpose.features import PatchExtractor
 from foundpose.geometry import PerspectiveCrop, pose_deviation
-from foundpose.matching import PatchMatcher, SoftPatchMatcher
+from foundpose.matching import Matcher, SoftPatchMatcher
 from foundpose.pipeline import (
     FoundPose,
     HypothesisScorer,
@@ -21,7 +21,7 @@ from foundpose.pipeline import (
     PoseEstimates,
     select_query_patches,
 )
-from foundpose.pnp import RansacPnp, TemplateStart
+from foundpose.pnp import PnpProblem, RansacPnp, TemplateStart
 from foundpose.refinement import PoseRefiner
 from foundpose.retrieval import Retriever, SpatialReranker, TemplateRetriever
 
@@ -54,7 +54,7 @@ class Stages(NamedTuple):
 
     crop: PerspectiveCrop
     retriever: Retriever
-    matcher: PatchMatcher | SoftPatchMatcher
+    matcher: Matcher
     pnp: RansacPnp
     refiner: PoseRefiner | None
     epnp: RansacPnp | None = None
@@ -220,7 +220,7 @@ def stage_tasks(
         T = stages.start(*inputs["start"])
 
         def polish() -> Any:
-            return stages.pnp.polish_starts(T.flatten(0, 1), *inputs["pnp"][:5])
+            return stages.pnp.polish_starts(T.flatten(0, 1), inputs["pnp"][0])
 
         tasks.append(task("templates' own poses", partial(stages.start, *inputs["start"])))
         tasks.append(task("polish of the templates' poses", polish))
@@ -291,19 +291,20 @@ def backward_tasks(
 
         tasks.append(task(f"{name}, w.r.t. images", partial(_gradient, describe, [crops])))
     soft = SoftPatchMatcher(5.0).to(crops.device)
-    query, query_valid, template, template_valid, pixels, points = inputs["matcher"][:6]
-    query, template = _leaf(query), _leaf(template)
+    query, template = (x._replace(descriptors=_leaf(x.descriptors)) for x in inputs["matcher"][:2])
 
     def match() -> Tensor:
-        return soft(query, query_valid, template, template_valid, pixels, points).points_model
+        return soft(query, template).points_model
 
-    tasks.append(task("soft matching, w.r.t. both descriptors", partial(_gradient, match, [query, template])))
-    points_image, points_model, K, valid, weights, priority = inputs["pnp"]
-    leaves = [_leaf(points_image), _leaf(points_model), _leaf(weights)]
+    both = [query.descriptors, template.descriptors]
+    tasks.append(task("soft matching, w.r.t. both descriptors", partial(_gradient, match, both)))
+    problem, priority = inputs["pnp"]
+    leaves = [_leaf(problem.points_image), _leaf(problem.points_model), _leaf(problem.weights)]
     pnp = stages.pnp
 
     def solve() -> Tensor:
-        return pnp(leaves[0], leaves[1], K, valid, leaves[2], priority).T_camera_from_model
+        given = PnpProblem(leaves[0], leaves[1], problem.K, problem.valid, leaves[2])
+        return pnp(given, priority).T_camera_from_model
 
     tasks.append(task(f"{pnp_name(h)}, w.r.t. points and weights", partial(_gradient, solve, leaves)))
     if stages.refiner is not None:

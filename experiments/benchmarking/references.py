@@ -99,10 +99,11 @@ def ransac_references(stages: Stages, workload: Workload) -> list[Reference]:
     """OpenCV's RANSAC, one problem after the other, with both of its minimal solvers."""
     inputs, coarse = stage_inputs(stages, workload, refine_all=False)
     arguments, h = inputs["pnp"], coarse.templates.index.shape[1]
-    points_image, points_model, K, valid = (_numpy(x) for x in arguments[:4])
+    given = arguments[0]
+    fields = (_numpy(x) for x in (given.points_image, given.points_model, given.K, given.valid))
     problems = [
         (x[mask].astype(np.float64), u[mask].astype(np.float64), k.astype(np.float64))
-        for u, x, k, mask in zip(points_image, points_model, K, valid, strict=True)
+        for u, x, k, mask in zip(*fields, strict=True)
     ]
     pnp = stages.pnp
     confidence = 0.9999 if pnp.confidence is None else pnp.confidence

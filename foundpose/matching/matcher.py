@@ -3,26 +3,26 @@
 from typing import Literal
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from foundpose.matching.base import Matches, check_patches
-from foundpose.matching.soft import (
+from foundpose.matching.base import Matcher, Matches
+from foundpose.matching.probabilities import (
     AUTO_TEMPERATURE,
+    Temperature,
     check_temperature,
     match_probabilities,
     needed_scale,
     point_confidence,
     point_moments,
 )
+from foundpose.representation import TemplatePatches
+from foundpose.retrieval import QueryPatches
 
 MatchingMode = Literal["nearest", "cyclic"]
 
 # Among matches whose cycles end as far away, those that are trusted sooner lie all over the crop: steps by the golden
 # ratio. (An order by descriptor distance would hang on the last digit.)
 _GOLDEN = 0.6180339887498949
-
-# Distances between all patches exist for one block of (crop, template) pairs at a time: 64 MiB in float32.
-_DISTANCES_PER_BLOCK = 1 << 24
 
 
 def nearest_patches(
@@ -72,83 +72,7 @@ def keep_best(valid: Tensor, cycle: Tensor | None, distance: Tensor, top_k: int)
     return torch.zeros_like(valid).scatter(-1, order[..., :top_k], True) & valid
 
 
-def match_patches(
-    query: Tensor,
-    query_valid: Tensor,
-    template: Tensor,
-    template_valid: Tensor,
-    query_pixels: Tensor,
-    template_points: Tensor,
-    mode: MatchingMode,
-    top_k: int | None,
-    temperature: float | None = None,
-) -> Matches:
-    """Match B crops to h templates each; shapes as in `PatchMatcher.forward`.
-
-    Args:
-        query: (B, P, d), finite.
-        query_valid: (B, P) bool.
-        template: (B, h, Q, d), finite.
-        template_valid: (B, h, Q) bool.
-        query_pixels: (B, P, 2).
-        template_points: (B, h, Q, 3), finite.
-        mode: whether ``top_k`` ranks by cycle distance.
-        top_k: number of matches to keep per template, or None for all.
-        temperature: of the confidences, or None for ones.
-
-    Returns:
-        The matches. Differentiable w.r.t. the descriptors through distances and weights, and w.r.t. the points.
-    """
-    B, h, Q = template_valid.shape
-    P = query.shape[1]
-    if min(B, h, P, Q) == 0:
-        nothing = query_valid.new_zeros(B, h, P)
-        zero = query.new_zeros(B, h, P)
-        points = template_points.new_zeros(B, h, P, 3)
-        return Matches(nothing.long(), zero + torch.inf, nothing, points, zero, zero - torch.inf)
-    template, template_valid = template.flatten(0, 1), template_valid.flatten(0, 1)
-    points = template_points.flatten(0, 1)
-    crop = torch.arange(B * h, device=query.device) // h
-    blocks = []
-    rows = max(1, _DISTANCES_PER_BLOCK // (P * Q))
-    for block in (slice(first, first + rows) for first in range(0, B * h, rows)):
-        mine = crop[block]
-        q, q_valid = query.index_select(0, mine), query_valid[mine]
-        t, t_valid, x = template[block], template_valid[block], points[block]
-        forth, back = nearest_patches(q, q_valid, t, t_valid)
-        ok = q_valid & t_valid.any(dim=1, keepdim=True)
-        nearest = t.gather(1, forth.unsqueeze(-1).expand_as(q))
-        # From the difference, not from the expanded square: accurate near zero.
-        length = torch.linalg.vector_norm(q - nearest, dim=-1)
-        pixels = query_pixels[mine]
-        cycle = torch.linalg.vector_norm(
-            pixels - pixels.gather(1, back.unsqueeze(-1).expand_as(pixels)), dim=-1
-        )
-        if top_k is not None:
-            ok = keep_best(ok, cycle if mode == "cyclic" else None, length, top_k)
-        spread = (torch.arange(P, device=query.device, dtype=torch.float64) * _GOLDEN).frac()
-        priority = -cycle - spread.to(cycle)
-        chosen = x.gather(1, forth.unsqueeze(-1).expand(-1, -1, 3))
-        if temperature is None:
-            weight = torch.ones_like(length)
-        else:
-            t = t.masked_fill(~t_valid.unsqueeze(-1), 0.0)
-            probability = match_probabilities(q, t, t_valid, temperature)
-            weight = point_confidence(point_moments(probability, x, t_valid, chosen)[1], x, t_valid)
-        blocks.append(
-            Matches(
-                forth.masked_fill(~ok, 0),
-                length.masked_fill(~ok, torch.inf),
-                ok,
-                chosen.masked_fill(~ok.unsqueeze(-1), 0.0),
-                weight.masked_fill(~ok, 0.0),
-                priority.masked_fill(~ok, -torch.inf),
-            )
-        )
-    return Matches(*(torch.cat(parts).unflatten(0, (B, h)) for parts in zip(*blocks, strict=True)))
-
-
-class PatchMatcher(nn.Module):
+class PatchMatcher(Matcher):
     """Matches each patch of a crop to the nearest patch (Euclidean) of each retrieved template.
 
     Args:
@@ -168,7 +92,7 @@ class PatchMatcher(nn.Module):
         self,
         mode: MatchingMode = "nearest",
         top_k: int | None = None,
-        confidence_temperature: float | Literal["auto"] | None = None,
+        confidence_temperature: Temperature | None = None,
     ) -> None:
         super().__init__()
         if mode not in ("nearest", "cyclic"):
@@ -179,62 +103,37 @@ class PatchMatcher(nn.Module):
             check_temperature(confidence_temperature)
         self.mode = mode
         self.top_k = top_k
-        self.confidence_temperature: float | Literal["auto"] | None = confidence_temperature
+        self.confidence_temperature: Temperature | None = confidence_temperature
 
-    def forward(
-        self,
-        query_descriptors: Tensor,
-        query_valid: Tensor,
-        template_descriptors: Tensor,
-        template_valid: Tensor,
-        query_pixels: Tensor,
-        template_points: Tensor,
-        match_distance: float | None = None,
+    def match_pairs(
+        self, query: QueryPatches, template: TemplatePatches, match_distance: float | None
     ) -> Matches:
-        """Match B crops with h templates each.
-
-        Args:
-            query_descriptors: (B, P, d).
-            query_valid: (B, P) bool.
-            template_descriptors: (B, h, Q, d).
-            template_valid: (B, h, Q) bool.
-            query_pixels: (B, P, 2) patch centres in the crop, pixels.
-            template_points: (B, h, Q, 3) the template patches' points, mesh units.
-            match_distance: median distance of right matches; for an automatic temperature.
-
-        Returns:
-            One match per crop patch and template; not valid where the patch is not, where the template has no
-            valid patch, or where ``top_k`` better ones exist. What stands in rows that are not valid (as long
-            as it is finite) has no influence.
-
-        Raises:
-            ValueError: If shapes do not fit.
+        """Nearest patches, the ``top_k`` best of them.
 
         Differentiable w.r.t. the descriptors through ``distance`` and (with a ``confidence_temperature``) ``weight``,
-        and w.r.t. ``template_points``; the choice of patches is constant.
+        and w.r.t. the points; the choice of patches is constant.
         """
-        check_patches(
-            query_descriptors,
-            query_valid,
-            template_descriptors,
-            template_valid,
-            query_pixels,
-            template_points,
-        )
+        q, t, points = query.descriptors, template.descriptors, template.points_model
+        forth, back = nearest_patches(q, query.valid, t, template.valid)
+        nearest = t.gather(1, forth.unsqueeze(-1).expand_as(q))
+        # From the difference, not from the expanded square: accurate near zero.
+        distance = torch.linalg.vector_norm(q - nearest, dim=-1)
+        returned = query.pixels.gather(1, back.unsqueeze(-1).expand_as(query.pixels))
+        cycle = torch.linalg.vector_norm(query.pixels - returned, dim=-1)
+        valid = query.valid & template.valid.any(dim=1, keepdim=True)
+        if self.top_k is not None:
+            valid = keep_best(valid, cycle if self.mode == "cyclic" else None, distance, self.top_k)
+        spread = (torch.arange(q.shape[1], device=q.device, dtype=torch.float64) * _GOLDEN).frac()
+        chosen = points.gather(1, forth.unsqueeze(-1).expand(-1, -1, 3))
+        weight = torch.ones_like(distance)
         temperature = self.confidence_temperature
-        if temperature == "auto":
-            temperature = AUTO_TEMPERATURE * needed_scale(match_distance)
-        return match_patches(
-            query_descriptors,
-            query_valid,
-            template_descriptors,
-            template_valid,
-            query_pixels,
-            template_points,
-            self.mode,
-            self.top_k,
-            temperature,
-        )
+        if temperature is not None:
+            if temperature == "auto":
+                temperature = AUTO_TEMPERATURE * needed_scale(match_distance)
+            probability = match_probabilities(q, t, template.valid, temperature)
+            _, variance = point_moments(probability, points, template.valid, chosen)
+            weight = point_confidence(variance, points, template.valid)
+        return Matches(forth, distance, valid, chosen, weight, -cycle - spread.to(cycle))
 
     def extra_repr(self) -> str:
         """Settings, for printing."""

@@ -6,11 +6,11 @@ import torch
 from torch import Tensor, nn
 
 from foundpose.geometry import invert_transform
-from foundpose.matching import PatchMatcher, SoftPatchMatcher
+from foundpose.matching import Matcher
 from foundpose.pipeline.results import Correspondences, Hypothesised, PoseHypotheses, PoseStatus
 from foundpose.pipeline.selection import better_of_two
 from foundpose.pipeline.verification import HypothesisScorer, InlierScore
-from foundpose.pnp import PnpResult, RansacPnp, TemplateStart, TopTemplatePose
+from foundpose.pnp import PnpProblem, PnpResult, RansacPnp, TemplateStart, TopTemplatePose
 from foundpose.pnp.soft_selection import choose_softly
 from foundpose.refinement import Observation, PoseProposals, PoseRefiner
 from foundpose.representation import ObjectRepresentation, take_rows
@@ -52,7 +52,7 @@ class MatchAndSolve(HypothesisMaker):
 
     def __init__(
         self,
-        matcher: PatchMatcher | SoftPatchMatcher,
+        matcher: Matcher,
         pnp: RansacPnp,
         scorer: HypothesisScorer | None = None,
         start: TemplateStart | None = None,
@@ -70,7 +70,7 @@ class MatchAndSolve(HypothesisMaker):
             lambda obj, rows: self._match(obj, take_rows(query, rows), take_rows(templates, rows))
         )
         B, h, P = found.valid.shape
-        problem = (
+        problem = PnpProblem(
             found.points_image.unsqueeze(1).expand(-1, h, -1, -1).reshape(B * h, P, 2),
             found.points_model.reshape(B * h, P, 3),
             crops.K_crop.unsqueeze(1).expand(-1, h, -1, -1).reshape(B * h, 3, 3),
@@ -89,11 +89,11 @@ class MatchAndSolve(HypothesisMaker):
                 score=self._score(T, num_inliers, observation),
             )
 
-        result = self.pnp(*problem, found.priority.reshape(B * h, P))
+        result = self.pnp(problem, found.priority.reshape(B * h, P))
         hypotheses = scored(result)
         if self.start is not None:
             T_start = self._starts(self.start, found, templates, observation)
-            polished = self.pnp.polish_starts(T_start.reshape(B * h, 4, 4), *problem)
+            polished = self.pnp.polish_starts(T_start.reshape(B * h, 4, 4), problem)
             hypotheses = better_of_two(hypotheses, scored(polished))
         candidates = None
         if result.candidates is not None and self.pnp.soft_selection is not None:
@@ -116,16 +116,8 @@ class MatchAndSolve(HypothesisMaker):
     ) -> Correspondences:
         """Match crops of one object with their templates."""
         patches = representation.gather_templates(templates.index)
-        template_valid = patches.valid & templates.valid.unsqueeze(-1)
-        matches = self.matcher(
-            query.descriptors,
-            query.valid,
-            patches.descriptors,
-            template_valid,
-            query.pixels,
-            patches.points_model,
-            representation.info.scales.get("match"),
-        )
+        patches = patches._replace(valid=patches.valid & templates.valid.unsqueeze(-1))
+        matches = self.matcher(query, patches, representation.info.scales.get("match"))
         chosen = matches.template_patch.unsqueeze(-1)
         return Correspondences(
             points_image=query.pixels,

@@ -1,9 +1,9 @@
 """Perspective-n-Point: minimal solvers, RANSAC, differentiable polish."""
 
-from foundpose.pnp.epnp import MinimalSolution, solve_epnp
+from foundpose.pnp.epnp import solve_epnp
 from foundpose.pnp.levenberg_marquardt import LevenbergMarquardtPnp, PnpOptimum
 from foundpose.pnp.p3p import P3PSolutions, solve_p3p
-from foundpose.pnp.polish import polish_pnp
+from foundpose.pnp.problem import MinimalSolution, PnpProblem
 from foundpose.pnp.ransac import PnpResult, PnpStatus, RansacPnp
 from foundpose.pnp.soft_selection import PoseCandidates, SoftInlierSelection
 from foundpose.pnp.template_pose import TemplatePoses, TopTemplatePose
@@ -14,6 +14,7 @@ __all__ = [
     "MinimalSolution",
     "P3PSolutions",
     "PnpOptimum",
+    "PnpProblem",
     "PnpResult",
     "PnpStatus",
     "PoseCandidates",
@@ -22,7 +23,6 @@ __all__ = [
     "TemplatePoses",
     "TemplateStart",
     "TopTemplatePose",
-    "polish_pnp",
     "solve_epnp",
     "solve_p3p",
 ]

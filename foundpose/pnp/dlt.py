@@ -5,7 +5,7 @@ from kornia.geometry import solve_pnp_dlt
 from torch import Tensor
 
 from foundpose.geometry.transforms import make_transform, transform_points
-from foundpose.pnp.epnp import MinimalSolution
+from foundpose.pnp.problem import MinimalSolution
 
 # Least spread of the points along their thinnest direction, of their root mean square distance from the centroid.
 # kornia refuses a whole batch for one sample that is flat.
@@ -20,7 +20,7 @@ def solve_dlt_minimal(rays: Tensor, points_model: Tensor) -> MinimalSolution:
         points_model: (S, n, 3) mesh units, finite.
 
     Returns:
-        A :class:`~foundpose.pnp.epnp.MinimalSolution`; flat samples are degenerate.
+        A :class:`~foundpose.pnp.problem.MinimalSolution`; flat samples are degenerate.
 
     Source: Hartley and Zisserman, "Multiple view geometry", section 7.1; ``kornia.geometry.solve_pnp_dlt``.
     """

@@ -11,14 +11,13 @@ and get the identity in the end, so that they neither have nor disturb a gradien
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from foundpose.geometry.transforms import make_transform, transform_points
 from foundpose.optimization.derivatives import attach_optimum, eigenbasis, safe_sqrt
-from foundpose.pnp.polish import check_correspondences, rays_of_usable_pixels, usable_coordinates
+from foundpose.pnp.problem import MinimalSolution, PnpProblem
 from foundpose.pnp.weak_perspective import align_points, weak_perspective_depths
 from foundpose.utils.devices import constant
 
@@ -30,24 +29,7 @@ _REFINEMENT_STEPS = 5
 _Equations = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
-class MinimalSolution(NamedTuple):
-    """Poses from a minimal solver.
-
-    Attributes:
-        T_camera_from_model: (B, 4, 4), always finite.
-        valid: (B,) bool, the points determine a pose and it has all of them in front of the camera.
-        degenerate: (B,) bool, the points do not determine a pose: fewer than four, collinear or coincident ones, one
-            pixel for all (of exactly four: for any two), or intrinsics without inverse. The pose is the identity.
-    """
-
-    T_camera_from_model: Tensor
-    valid: Tensor
-    degenerate: Tensor
-
-
-def solve_epnp(
-    points_image: Tensor, points_model: Tensor, K: Tensor, weights: Tensor | None = None
-) -> MinimalSolution:
+def solve_epnp(problem: PnpProblem) -> MinimalSolution:
     """Estimate poses by EPnP, planar and non-planar objects alike.
 
     For N > 4, candidates come from one, two and three null vectors by linearisation and from all of them by a
@@ -56,19 +38,16 @@ def solve_epnp(
     mirrored weak-perspective starts are the candidates there.
 
     Args:
-        points_image: (B, N, 2) pixels.
-        points_model: (B, N, 3) mesh units.
-        K: (B, 3, 3) intrinsics.
-        weights: (B, N), or a bool mask; None means all ones. Points whose weight is not positive, or any number of
-            which is not finite, are ignored. With N = 4 weights only tell whether all four points are there.
+        problem: B problems of N ≥ 4 correspondences. Points that are not valid, whose weight is not positive, or any
+            number of which is not finite, are ignored. With N = 4 weights only tell whether all four are there.
 
     Returns:
         A :class:`MinimalSolution`. Bad samples are flagged; nothing is raised for them.
 
     Raises:
-        ValueError: shapes or dtypes do not fit, or N < 4.
+        ValueError: N < 4.
 
-    Differentiable w.r.t. ``points_image``, ``points_model``, ``K`` and, for N > 4, ``weights`` (first
+    Differentiable w.r.t. the points, ``K`` and, for N > 4, the weights (first
     derivatives), finite everywhere and zero for degenerate samples. It is the exact gradient of the least-squares
     optimum β of the winning candidate: equal to that of the returned pose where the five refinement steps have
     converged, as they mostly do, not so well under strong noise with N = 4. Which candidate wins is a choice and
@@ -79,21 +58,19 @@ def solve_epnp(
 
     Source: Lepetit, Moreno-Noguer and Fua, "EPnP: an accurate O(n) solution to the PnP problem", IJCV 2009.
     """
-    check_correspondences(points_image, points_model, K, weights)
-    if points_image.shape[1] < 4:
-        raise ValueError(f"EPnP needs at least 4 correspondences, got N = {points_image.shape[1]}")
-    present = torch.ones_like(points_image[..., 0]) if weights is None else weights.to(points_image.dtype)
-    rays, usable = rays_of_usable_pixels(points_image, K)
-    usable = usable & usable_coordinates(rays) & usable_coordinates(points_model)
-    usable = usable & (present > 0) & torch.isfinite(present)
-    if points_image.shape[1] == 4:
+    count = problem.points_image.shape[1]
+    if count < 4:
+        raise ValueError(f"EPnP needs at least 4 correspondences, got N = {count}")
+    problem, invertible = problem.clean()
+    usable = problem.valid & invertible.unsqueeze(-1)
+    if count == 4:
         usable = usable.all(-1, keepdim=True).expand_as(usable)
     bad = ~usable.unsqueeze(-1)
-    rays = torch.where(bad, constant([0.0, 0.0, 1.0], rays), rays)
-    points_model = points_model.masked_fill(bad, 0.0)
-    if points_image.shape[1] == 4:
+    rays = torch.where(bad, constant([0.0, 0.0, 1.0], problem.K), problem.rays())
+    points_model = problem.points_model.masked_fill(bad, 0.0)
+    if count == 4:
         return solve_epnp_minimal(rays, points_model)  # which flags four equal points
-    return _solve_overdetermined(rays, points_model, present.masked_fill(~usable, 0.0))
+    return _solve_overdetermined(rays, points_model, problem.weights.masked_fill(~usable, 0.0))
 
 
 def solve_epnp_minimal(rays: Tensor, points_model: Tensor) -> MinimalSolution:

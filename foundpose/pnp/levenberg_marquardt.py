@@ -5,11 +5,19 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from foundpose.optimization import Differentiation, LevenbergMarquardtResult, RobustLoss
-from foundpose.optimization.cholesky import scaled_cholesky
+from foundpose.optimization import (
+    Differentiation,
+    LeastSquares,
+    LevenbergMarquardtResult,
+    RobustLoss,
+    attach_implicit_gradient,
+    optimise_pose,
+)
+from foundpose.optimization.covariance import pose_covariance, residual_variance
 from foundpose.optimization.implicit import check_differentiation
-from foundpose.pnp.polish import LocalFrame, attach_pnp_gradient, polish_pnp, unit_weights
-from foundpose.pnp.scoring import reprojection_errors
+from foundpose.optimization.local_frame import LocalFrame
+from foundpose.pnp.cost import reprojection_cost, reprojection_errors
+from foundpose.pnp.problem import PnpProblem, usable_coordinates
 
 
 class PnpOptimum(NamedTuple):
@@ -77,53 +85,33 @@ class LevenbergMarquardtPnp(nn.Module):
         if noise is not None and not noise > 0:
             raise ValueError(f"noise must be positive (pixels) or None, got {noise}")
         check_differentiation(differentiation)
-        self.loss = loss
+        self.loss = LeastSquares() if loss is None else loss
         self.max_iterations = max_iterations
         self.tolerance = tolerance
         self.differentiation: Differentiation = differentiation
         self.noise = noise
 
-    def forward(
-        self,
-        T_camera_from_model: Tensor,
-        points_image: Tensor,
-        points_model: Tensor,
-        K: Tensor,
-        weights: Tensor | None = None,
-    ) -> PnpOptimum:
+    def forward(self, T_camera_from_model: Tensor, problem: PnpProblem) -> PnpOptimum:
         """Optimise one pose per problem.
 
         Args:
             T_camera_from_model: (B, 4, 4) initial poses with every weighted point in front of the camera.
-            points_image: (B, N, 2) pixels.
-            points_model: (B, N, 3) mesh units.
-            K: (B, 3, 3) intrinsics.
-            weights: (B, N), not negative, or a bool mask; None means all ones. Points of weight zero are ignored.
+            problem: B problems. Points that are not valid or of weight zero are ignored.
 
         Returns:
             A :class:`PnpOptimum`.
 
-        Raises:
-            ValueError: shapes or dtypes do not fit.
-
-        Differentiable w.r.t. ``points_image``, ``points_model``, ``K``, ``weights`` and the loss's parameters; in
-        mode "unrolled" also w.r.t. the initial poses. ``T_camera_from_model`` and ``cost`` carry the gradient.
-        Implicit gradients can be taken once (no second derivative). Where the points do not determine the pose they
-        are zero. The weight of a point that is left out has none.
+        Differentiable w.r.t. the problem's points, ``K`` and weights, and the loss's parameters; in mode "unrolled"
+        also w.r.t. the initial poses. ``T_camera_from_model`` and ``cost`` carry the gradient. Implicit gradients can
+        be taken once (no second derivative). Where the points do not determine the pose they are zero. The weight of
+        a point that is left out has none.
         """
-        with torch.autocast(points_image.device.type, enabled=False):
-            result, frame = self.optimise(T_camera_from_model, points_image, points_model, K, weights)
-            weights = unit_weights(points_image) if weights is None else weights.to(points_image.dtype)
-            covariance = self._covariance(
-                result.failed,
-                result.T.detach(),
-                result.H.detach(),
-                frame,
-                points_image.detach(),
-                points_model.detach(),
-                K.detach(),
-                weights.detach(),
-            )
+        # Autocast would run the matrix products in half precision, too coarse for poses.
+        with torch.autocast(problem.K.device.type, enabled=False):
+            result, frame = self.optimise(T_camera_from_model, problem)
+            variance = self._variance(result.T.detach(), problem.detach())
+            variance = variance.masked_fill(result.failed, torch.inf)
+            covariance = pose_covariance(result.H, variance, frame)
         return PnpOptimum(
             result.T,
             covariance,
@@ -138,68 +126,82 @@ class LevenbergMarquardtPnp(nn.Module):
     def optimise(
         self,
         T_camera_from_model: Tensor,
-        points_image: Tensor,
-        points_model: Tensor,
-        K: Tensor,
-        weights: Tensor | None = None,
+        problem: PnpProblem,
         tolerance: float | None = None,
         max_iterations: int | None = None,
     ) -> tuple[LevenbergMarquardtResult, LocalFrame]:
-        """What :meth:`forward` does, without the covariance; see :func:`polish_pnp` for what is returned.
+        """What :meth:`forward` does, without the covariance.
 
-        ``tolerance`` takes the place of this module's own, and ``max_iterations`` lowers it.
+        Args:
+            T_camera_from_model: see :meth:`forward`.
+            problem: see :meth:`forward`.
+            tolerance: takes the place of this module's own.
+            max_iterations: lowers this module's own.
+
+        Returns:
+            A :class:`~foundpose.optimization.LevenbergMarquardtResult` with costs in px², and the frame that its
+            ``H`` belongs to. A sample whose initial pose has a weighted point behind the camera, that has no weighted
+            point, or any number in which is not finite, comes back as it was with ``failed`` set and without a
+            gradient.
         """
-        return polish_pnp(
-            T_camera_from_model,
-            points_image,
-            points_model,
-            K,
+        T, K = T_camera_from_model, problem.K
+        weights = problem.weights.masked_fill(~problem.valid, 0.0)
+        finite = usable_coordinates(problem.points_image) & usable_coordinates(problem.points_model)
+        sane = torch.isfinite(T).all(-1).all(-1) & torch.isfinite(K).all(-1).all(-1)
+        sane = sane & (torch.isfinite(weights) & (finite | (weights == 0))).all(-1)
+        # Stand-ins without weight, which fail: no NaN may enter the graph, not even multiplied by zero.
+        identity = torch.eye(4, dtype=T.dtype, device=T.device)
+        T = torch.where(sane[:, None, None], T, identity)
+        weights = weights.masked_fill(~(sane.unsqueeze(-1) & (weights > 0)), 0.0)
+        left_out = (weights == 0).unsqueeze(-1)
+        problem = PnpProblem(
+            problem.points_image.masked_fill(left_out, 0.0),
+            problem.points_model.masked_fill(left_out, 0.0),
+            torch.where(sane[:, None, None], K, identity[:3, :3]),
+            problem.valid,
             weights,
-            loss=self.loss,
+        )
+        implicit = self.differentiation == "implicit"
+        # The optimum does not depend on the frame that it is looked for in, nor on where the search begins.
+        frame = _local_frame(T.detach(), problem.detach()) if implicit else _local_frame(T, problem)
+        # Pixel coordinates carry rounding errors of a few units in their last place.
+        rounding = 8.0 * torch.finfo(T.dtype).eps * problem.K.detach().abs().amax((-1, -2))
+        result = optimise_pose(
+            reprojection_cost(problem, frame, self.loss),
+            frame.pose_to_local(T.detach() if implicit else T),
+            differentiation=self.differentiation,
             max_iterations=min(self.max_iterations, max_iterations or self.max_iterations),
             tolerance=self.tolerance if tolerance is None else tolerance,
-            differentiation=self.differentiation,
+            floor=weights.detach().sum(-1) * rounding.square(),
         )
+        T = torch.where(sane[:, None, None], frame.pose_from_local(result.T), T_camera_from_model)
+        return result._replace(T=T), frame
 
-    def attach_gradient(
-        self,
-        T_camera_from_model: Tensor,
-        points_image: Tensor,
-        points_model: Tensor,
-        K: Tensor,
-        weights: Tensor,
-    ) -> tuple[Tensor, Tensor]:
-        """Give poses that this module has found (B, 4, 4) the implicit gradient, without touching their values, and
-        say which have one (B,)."""
-        return attach_pnp_gradient(T_camera_from_model, points_image, points_model, K, weights, self.loss)
+    def attach_gradient(self, T_camera_from_model: Tensor, problem: PnpProblem) -> tuple[Tensor, Tensor]:
+        """Give poses that this module has found (B, 4, 4) the gradient of the optimum.
 
-    def _covariance(
-        self,
-        failed: Tensor,
-        T: Tensor,
-        H: Tensor,
-        frame: LocalFrame,
-        points_image: Tensor,
-        points_model: Tensor,
-        K: Tensor,
-        weights: Tensor,
-    ) -> Tensor:
-        """Inverse of the Gauss-Newton matrix, moved to the camera frame and scaled by the variance of the noise."""
-        if self.noise is None:
-            squared, depth = reprojection_errors(T, points_image, points_model, K)
-            slope = torch.ones_like(squared) if self.loss is None else self.loss(squared)[1].detach()
-            used = (weights > 0) & (depth > 0)
-            share = torch.where(used, weights * slope, torch.zeros_like(slope))
-            # Two equations a point, of which a robust loss counts but a part, against six unknowns.
-            freedom = 2.0 * torch.where(used, slope, torch.zeros_like(slope)).sum(-1) - 6.0
-            residual = torch.where(used, share * squared, torch.zeros_like(squared)).sum(-1)
-            variance = residual / freedom.clamp(min=torch.finfo(freedom.dtype).eps)
-            known = freedom > 0.5
-        else:
-            variance = torch.full_like(H[:, 0, 0], self.noise**2)
-            known = torch.ones_like(variance, dtype=torch.bool)
-        system = scaled_cholesky(H, H.diagonal(dim1=-2, dim2=-1))
-        to_camera = frame.twist_to_camera()
-        covariance = variance[:, None, None] * (to_camera @ system.inverse() @ to_camera.transpose(-1, -2))
-        unknown = torch.diag_embed(torch.full_like(H[:, 0], torch.inf))
-        return torch.where((known & system.usable & ~failed)[:, None, None], covariance, unknown)
+        Returns:
+            The poses, which do not change by a single bit, and which of them have a well-conditioned optimum (B,);
+            the others have a gradient of zero.
+        """
+        T = T_camera_from_model.detach()
+        frame = _local_frame(T, problem.detach())
+        cost = reprojection_cost(problem, frame, self.loss)
+        optimum = attach_implicit_gradient(cost, frame.pose_to_local(T))
+        attached = frame.pose_from_local(optimum.T)
+        return T + (attached - attached.detach()), optimum.regular
+
+    def _variance(self, T: Tensor, problem: PnpProblem) -> Tensor:
+        """Variance (B,) of an image coordinate of weight one, px²; infinite where it is not known."""
+        if self.noise is not None:
+            return torch.full_like(T[:, 0, 0], self.noise**2)
+        squared, depth = reprojection_errors(T, problem)
+        used = problem.valid & (problem.weights > 0) & (depth > 0)
+        slope = torch.where(used, self.loss(squared)[1].detach(), 0.0)
+        residual = torch.where(used, problem.weights * slope * squared, 0.0).sum(-1)
+        # Two equations a point, of which a robust loss counts but a part, against six unknowns.
+        return residual_variance(residual, 2.0 * slope.sum(-1) - 6.0)
+
+
+def _local_frame(T: Tensor, problem: PnpProblem) -> LocalFrame:
+    return LocalFrame.at(T, problem.points_model, problem.weights)

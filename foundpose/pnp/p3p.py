@@ -18,8 +18,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from foundpose.geometry.transforms import make_transform
-from foundpose.pnp.polish import check_correspondences, rays_of_usable_pixels, usable_coordinates
+from foundpose.geometry.transforms import make_transform, transform_points
+from foundpose.pnp.problem import MinimalSolution, PnpProblem, usable_coordinates
 
 _CUBIC_STEPS, _POLISH_STEPS = 5, 2
 _LARGEST_SLOPE = 100.0  # x / z of a ray; no pinhole camera sees as far from its axis
@@ -43,28 +43,49 @@ class P3PSolutions(NamedTuple):
     degenerate: Tensor
 
 
-def solve_p3p(points_image: Tensor, points_model: Tensor, K: Tensor) -> P3PSolutions:
+def solve_p3p(problem: PnpProblem) -> P3PSolutions:
     """All poses that bring three model points onto the rays through three pixels.
 
     Args:
-        points_image: (B, 3, 2) pixels.
-        points_model: (B, 3, 3) mesh units.
-        K: (B, 3, 3) intrinsics.
+        problem: B problems of N = 3 correspondences, all of which must be valid; weights do not matter.
 
     Returns:
         :class:`P3PSolutions`. Bad samples are flagged; nothing is raised for them.
 
     Raises:
-        ValueError: shapes or dtypes do not fit.
+        ValueError: N is not 3.
 
-    Differentiable w.r.t. ``points_image``, ``points_model`` and ``K``, as :func:`solve_p3p_rays`; its source too.
+    Differentiable w.r.t. the points and ``K``, as :func:`solve_p3p_rays`; its source too.
     """
-    check_correspondences(points_image, points_model, K, None)
-    if points_image.shape[1] != 3:
-        raise ValueError(f"P3P needs exactly 3 correspondences, got N = {points_image.shape[1]}")
-    rays, usable = rays_of_usable_pixels(points_image, K)
-    rays = rays.masked_fill(~usable.all(-1)[:, None, None], 0.0)
-    return solve_p3p_rays(rays, points_model)  # which flags three equal rays
+    if problem.points_image.shape[1] != 3:
+        raise ValueError(f"P3P needs exactly 3 correspondences, got N = {problem.points_image.shape[1]}")
+    problem, invertible = problem.clean()
+    usable = problem.valid.all(-1) & invertible
+    rays = problem.rays().masked_fill(~usable[:, None, None], 0.0)
+    return solve_p3p_rays(rays, problem.points_model)  # which flags three equal rays
+
+
+def solve_p3p_minimal(rays: Tensor, points_model: Tensor) -> MinimalSolution:
+    """P3P on the first three of four correspondences; the fourth chooses among the roots.
+
+    Args:
+        rays: (S, 4, 3) rays in the camera frame with z = 1, finite.
+        points_model: (S, 4, 3) mesh units, finite.
+
+    Returns:
+        A :class:`MinimalSolution`.
+    """
+    roots = solve_p3p_rays(rays[:, :3], points_model[:, :3])
+    T = roots.T_camera_from_model
+    fourth = transform_points(T, points_model[:, None, 3:]).squeeze(-2)  # (S, 4, 3)
+    ahead = roots.valid & (fourth[..., 2] > 0)
+    plane = fourth[..., :2] / torch.where(ahead, fourth[..., 2], torch.ones_like(fourth[..., 2])).unsqueeze(
+        -1
+    )
+    error = (plane - rays[:, None, 3, :2]).square().sum(-1).masked_fill(~ahead, torch.inf)
+    best = error.argmin(dim=1, keepdim=True)
+    T = torch.take_along_dim(T, best[..., None, None], dim=1).squeeze(1)
+    return MinimalSolution(T, ahead.any(1), roots.degenerate)
 
 
 def solve_p3p_rays(rays: Tensor, points_model: Tensor) -> P3PSolutions:

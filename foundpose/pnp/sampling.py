@@ -8,18 +8,44 @@ import torch
 from torch import Tensor
 
 from foundpose.geometry.cameras import pixel_rays
-from foundpose.geometry.transforms import transform_points
 from foundpose.pnp.dlt import solve_dlt_minimal
-from foundpose.pnp.epnp import MinimalSolution, solve_epnp_minimal
-from foundpose.pnp.p3p import solve_p3p_rays
+from foundpose.pnp.epnp import solve_epnp_minimal
+from foundpose.pnp.p3p import solve_p3p_minimal
+from foundpose.pnp.problem import MinimalSolution, PnpProblem
 from foundpose.pnp.scoring import score_poses
 
-# Correspondences of a sample.
-_SAMPLE_SIZES = {"epnp": 4, "p3p": 4, "dlt": 6}
 # A sample of inliers only may still be a poor one, through their noise: this many are drawn whatever the confidence.
 _LEAST_SAMPLES = 50
 
 SolverName = Literal["epnp", "p3p", "dlt"]
+
+# Correspondences of a sample, and its solver: rays (S, n, 3) and model points (S, n, 3) to poses.
+_SOLVERS: dict[str, tuple[int, Callable[[Tensor, Tensor], MinimalSolution]]] = {
+    "epnp": (4, solve_epnp_minimal),
+    "p3p": (4, solve_p3p_minimal),
+    "dlt": (6, solve_dlt_minimal),
+}
+
+
+class Sampling(NamedTuple):
+    """How minimal samples are solved and scored.
+
+    Attributes:
+        solver: minimal solver.
+        threshold: of an inlier, pixels.
+        confidence: a problem's samples count until an all-inlier sample has been drawn with this probability (and 50
+            in any case); None means that all count.
+        chunk: samples solved at once; None chooses. It has no influence on the result.
+        score_points: at most this many correspondences of a problem, evenly spread, score the samples; None: all.
+        keep: number J of hypotheses to keep.
+    """
+
+    solver: SolverName
+    threshold: float
+    confidence: float | None = None
+    chunk: int | None = None
+    score_points: int | None = None
+    keep: int = 1
 
 
 class Hypotheses(NamedTuple):
@@ -36,37 +62,6 @@ class Hypotheses(NamedTuple):
     determined: Tensor
 
 
-def solve_p3p_minimal(rays: Tensor, points_model: Tensor) -> MinimalSolution:
-    """P3P on the first three of four correspondences; the fourth chooses among the roots.
-
-    Args:
-        rays: (S, 4, 3) rays in the camera frame with z = 1, finite.
-        points_model: (S, 4, 3) mesh units, finite.
-
-    Returns:
-        A :class:`MinimalSolution`.
-    """
-    roots = solve_p3p_rays(rays[:, :3], points_model[:, :3])
-    T = roots.T_camera_from_model
-    fourth = transform_points(T, points_model[:, None, 3:]).squeeze(-2)  # (S, 4, 3)
-    ahead = roots.valid & (fourth[..., 2] > 0)
-    plane = fourth[..., :2] / torch.where(ahead, fourth[..., 2], torch.ones_like(fourth[..., 2])).unsqueeze(
-        -1
-    )
-    error = (plane - rays[:, None, 3, :2]).square().sum(-1).masked_fill(~ahead, torch.inf)
-    best = error.argmin(dim=1, keepdim=True)
-    T = torch.take_along_dim(T, best[..., None, None], dim=1).squeeze(1)
-    return MinimalSolution(T, ahead.any(1), roots.degenerate)
-
-
-# Rays (S, n, 3) and model points (S, n, 3) to poses.
-_SOLVERS: dict[str, Callable[[Tensor, Tensor], MinimalSolution]] = {
-    "epnp": solve_epnp_minimal,
-    "p3p": solve_p3p_minimal,
-    "dlt": solve_dlt_minimal,
-}
-
-
 def sample_size(solver: str) -> int:
     """How many correspondences a minimal solver takes.
 
@@ -75,83 +70,47 @@ def sample_size(solver: str) -> int:
     """
     if solver not in _SOLVERS:
         raise ValueError(f"solver must be one of {sorted(_SOLVERS)}, got {solver!r}")
-    return _SAMPLE_SIZES[solver]
+    return _SOLVERS[solver][0]
 
 
 def sample_hypotheses(
-    points_image: Tensor,
-    points_model: Tensor,
-    K: Tensor,
-    valid: Tensor,
-    usable: Tensor,
-    draws: Tensor,
-    *,
-    priority: Tensor | None = None,
-    solver: SolverName,
-    threshold: float,
-    confidence: float | None,
-    chunk: int | None = None,
-    score_points: int | None = None,
-    keep: int = 1,
+    problem: PnpProblem, usable: Tensor, draws: Tensor, sampling: Sampling, priority: Tensor | None = None
 ) -> Hypotheses:
     """Solve and score minimal samples until each problem has had enough.
 
     Args:
-        points_image: (B, N, 2) pixels, finite.
-        points_model: (B, N, 3), finite.
-        K: (B, 3, 3), invertible.
-        valid: (B, N) bool.
+        problem: B clean problems.
         usable: (B,) bool, problems to look at; they have at least as many valid correspondences as a sample.
         draws: (I, n) integers in [0, 2³¹), the same for all problems; small ones stand for high priorities.
+        sampling: how they are solved and scored.
         priority: (B, N); None: that of the order given.
-        solver: minimal solver.
-        threshold: of an inlier, pixels.
-        confidence: a problem's samples count until an all-inlier sample has been drawn with this probability (and 50
-            in any case); None means that all count.
-        chunk: samples solved at once; None chooses. It has no influence on the result.
-        score_points: at most this many correspondences of a problem, evenly spread, score the samples; None: all.
-        keep: number J of hypotheses to keep.
 
     Returns:
         The best hypotheses. Not differentiable: give it detached tensors.
     """
-    batch, points = valid.shape
+    batch, points = problem.valid.shape
+    K, keep = problem.K, sampling.keep
     best_T = torch.eye(4, dtype=K.dtype, device=K.device).repeat(batch, keep, 1, 1)
     best_quality = K.new_full((batch, keep), -1.0)
     determined = torch.zeros_like(usable)
     if batch == 0 or points < draws.shape[1]:
         return Hypotheses(best_T, best_quality, determined)
-    # Valid correspondences first, so that a rank among the valid ones becomes an index.
-    order = torch.argsort((~valid).to(torch.uint8), dim=-1, stable=True)
-    spread = order
-    if priority is not None:
-        last = priority.nan_to_num(nan=-torch.inf).masked_fill(~valid, -torch.inf)
-        by_priority = last.argsort(dim=-1, descending=True, stable=True)
-        # Priorities of −inf stay before what is not valid.
-        order = by_priority.gather(
-            -1, (~valid.gather(-1, by_priority)).to(torch.uint8).argsort(dim=-1, stable=True)
-        )
-    data = _Correspondences(
-        pixel_rays(points_image, K),
-        points_model,
-        K,
-        order,
-        valid.sum(-1),
-        *_scored_points(points_image, points_model, valid, spread, score_points),
-    )
+    pool = _Pool.of(problem, sampling.score_points, priority)
     # All problems take part in the first chunk, also those that are not usable: to leave them out would cost a look.
     rows: Tensor | None = None
     first = 0
-    for size in _chunk_sizes(chunk, batch, len(draws), points_image.device):
-        mine = data if rows is None else data.take(rows)
-        samples = _solve_and_score(mine, draws[first : first + size], solver, threshold)
+    for size in _chunk_sizes(sampling.chunk, batch, len(draws), K.device):
+        mine = pool if rows is None else pool.take(rows)
+        samples = _solve_and_score(mine, draws[first : first + size], sampling)
         before = best_quality if rows is None else best_quality[rows]
         before_T = best_T if rows is None else best_T[rows]
         active = usable if rows is None else usable[rows]
         quality = samples.quality.masked_fill(~active.unsqueeze(1), -1.0)
         enough = None
-        if confidence is not None:
-            enough = _has_enough(before[:, :1], quality, first, mine.num_scored, confidence, draws.shape[1])
+        if sampling.confidence is not None:
+            best = torch.maximum(quality.cummax(dim=1).values, before[:, :1])
+            ratio = best.clamp(min=0.0).floor() / mine.scored.valid.sum(-1, keepdim=True).clamp(min=1)
+            enough = _has_enough(ratio, first, sampling.confidence, draws.shape[1])
             # A sample counts if those before it were not enough.
             quality[:, 1:].masked_fill_(enough[:, :-1], -1.0)
         known = (~samples.degenerate).any(1) & active
@@ -179,22 +138,35 @@ def sample_hypotheses(
     return Hypotheses(best_T, best_quality, determined)
 
 
-class _Correspondences(NamedTuple):
-    """What samples of P problems are drawn from and scored on."""
+class _Pool(NamedTuple):
+    """What samples of P problems are drawn from and scored on: rays (P, N, 3) and model points (P, N, 3), indices of
+    the correspondences, valid ones by priority first (P, N), how many are valid (P,), and the part that scores."""
 
     rays: Tensor
     points_model: Tensor
-    K: Tensor
     order: Tensor
     num_valid: Tensor
-    scored_image: Tensor
-    scored_model: Tensor
-    scored: Tensor
-    num_scored: Tensor
+    scored: PnpProblem
 
-    def take(self, rows: Tensor) -> "_Correspondences":
+    @classmethod
+    def of(cls, problem: PnpProblem, score_points: int | None, priority: Tensor | None) -> "_Pool":
+        valid = problem.valid
+        # Valid correspondences first, so that a rank among the valid ones becomes an index.
+        order = torch.argsort((~valid).to(torch.uint8), dim=-1, stable=True)
+        scored = _scored_points(problem, order, score_points)
+        if priority is not None:
+            last = priority.nan_to_num(nan=-torch.inf).masked_fill(~valid, -torch.inf)
+            by_priority = last.argsort(dim=-1, descending=True, stable=True)
+            # Priorities of −inf stay before what is not valid.
+            missing = (~valid.gather(-1, by_priority)).to(torch.uint8)
+            order = by_priority.gather(-1, missing.argsort(dim=-1, stable=True))
+        rays = pixel_rays(problem.points_image, problem.K)
+        return cls(rays, problem.points_model, order, valid.sum(-1), scored)
+
+    def take(self, rows: Tensor) -> "_Pool":
         """Some of the problems."""
-        return _Correspondences(*(field[rows] for field in self))
+        rays, points_model, order, num_valid = (field[rows] for field in self[:4])
+        return _Pool(rays, points_model, order, num_valid, self.scored.take(rows))
 
 
 class _Samples(NamedTuple):
@@ -221,61 +193,48 @@ def _chunk_sizes(chunk: int | None, batch: int, total: int, device: torch.device
         chunk = min(2 * chunk, largest)
 
 
-def _scored_points(
-    points_image: Tensor, points_model: Tensor, valid: Tensor, order: Tensor, most: int | None
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Pixels (B, M, 2), points (B, M, 3) and mask (B, M) of the correspondences that score, and their number (B,)."""
-    count = valid.sum(-1)
-    if most is None or most >= valid.shape[1]:
-        return points_image, points_model, valid, count
-    place = torch.arange(most, device=valid.device)
+def _scored_points(problem: PnpProblem, order: Tensor, most: int | None) -> PnpProblem:
+    """At most so many correspondences of each problem."""
+    count, width = problem.valid.sum(-1, keepdim=True), problem.valid.shape[1]
+    if most is None or most >= width:
+        return problem
+    place = torch.arange(most, device=order.device)
     number = count.clamp(max=most)
     # Evenly spread over the valid ones, which come in the order of the image's rows.
-    rank = (place * count.unsqueeze(1)) // number.clamp(min=1).unsqueeze(1)
-    index = order.gather(1, rank.clamp(max=valid.shape[1] - 1)).unsqueeze(-1)
-    return (
-        torch.take_along_dim(points_image, index, dim=1),
-        torch.take_along_dim(points_model, index, dim=1),
-        place < number.unsqueeze(1),
-        number,
+    rank = (place * count) // number.clamp(min=1)
+    index = order.gather(1, rank.clamp(max=width - 1)).unsqueeze(-1)
+    return PnpProblem(
+        torch.take_along_dim(problem.points_image, index, dim=1),
+        torch.take_along_dim(problem.points_model, index, dim=1),
+        problem.K,
+        place < number,
     )
 
 
-def _solve_and_score(data: _Correspondences, draws: Tensor, solver: SolverName, threshold: float) -> _Samples:
+def _solve_and_score(pool: _Pool, draws: Tensor, sampling: Sampling) -> _Samples:
     """Poses of samples and their qualities."""
-    size = draws.shape[1]
-    ranks = distinct_ranks(draws, data.num_valid.clamp(min=size))
-    index = torch.take_along_dim(data.order, ranks.flatten(1), dim=1).unsqueeze(-1)
-    solution = _SOLVERS[solver](
-        torch.take_along_dim(data.rays, index, dim=1).reshape(-1, size, 3),
-        torch.take_along_dim(data.points_model, index, dim=1).reshape(-1, size, 3),
+    size, solve = _SOLVERS[sampling.solver]
+    ranks = distinct_ranks(draws, pool.num_valid.clamp(min=size))
+    index = torch.take_along_dim(pool.order, ranks.flatten(1), dim=1).unsqueeze(-1)
+    solution = solve(
+        torch.take_along_dim(pool.rays, index, dim=1).reshape(-1, size, 3),
+        torch.take_along_dim(pool.points_model, index, dim=1).reshape(-1, size, 3),
     )
-    samples = ranks.shape[:2]
-    T = solution.T_camera_from_model.unflatten(0, samples)
-    quality = score_poses(T, data.scored_image, data.scored_model, data.K, data.scored, threshold)
-    return _Samples(
-        T,
-        quality.masked_fill(~solution.valid.unflatten(0, samples), -1.0),
-        solution.degenerate.unflatten(0, samples),
-    )
+    T, valid, degenerate = (x.unflatten(0, ranks.shape[:2]) for x in solution)
+    quality = score_poses(T, pool.scored, sampling.threshold)
+    return _Samples(T, quality.masked_fill(~valid, -1.0), degenerate)
 
 
-def _has_enough(
-    before: Tensor, quality: Tensor, first: int, num_scored: Tensor, confidence: float, size: int
-) -> Tensor:
+def _has_enough(ratio: Tensor, first: int, confidence: float, size: int) -> Tensor:
     """Whether, after each of further samples (P, I), one with inliers only has been drawn with that probability.
 
     Args:
-        before: (P, 1) best quality before these samples.
-        quality: (P, I).
+        ratio: (P, I) best share of inliers so far.
         first: number of samples before these.
-        num_scored: (P,) number of correspondences that the qualities count.
         confidence: the probability.
         size: correspondences of a sample.
     """
-    best = torch.maximum(quality.cummax(dim=1).values, before)
-    ratio = best.clamp(min=0.0).floor() / num_scored.clamp(min=1).unsqueeze(1)
-    drawn = torch.arange(first + 1, first + 1 + quality.shape[1], device=quality.device)
+    drawn = torch.arange(first + 1, first + 1 + ratio.shape[1], device=ratio.device)
     missed = drawn * torch.log1p(-ratio.clamp(max=1.0 - 1e-6).pow(size))
     return (missed <= math.log(1.0 - confidence)) & (drawn >= _LEAST_SAMPLES)
 

@@ -1,27 +1,22 @@
-"""Quality of poses by the reprojection errors of their correspondences."""
+"""Quality of many poses by the reprojection errors of their correspondences."""
 
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from foundpose.optimization.robust import RobustLoss
+from foundpose.pnp.problem import PnpProblem
 
 # Numbers of a buffer that stays in a core's cache.
 _CPU_NUMBERS_PER_BLOCK = 1 << 16
 
 
-def score_poses(
-    T: Tensor, points_image: Tensor, points_model: Tensor, K: Tensor, valid: Tensor, threshold: float
-) -> Tensor:
+def score_poses(T: Tensor, problem: PnpProblem, threshold: float) -> Tensor:
     """Quality of several poses per problem: the inlier count, plus a fraction that grows as errors shrink.
 
     Args:
         T: (B, S, 4, 4) poses.
-        points_image: (B, N, 2) pixels.
-        points_model: (B, N, 3).
-        K: (B, 3, 3).
-        valid: (B, N) bool.
+        problem: B problems; what is not valid does not count.
         threshold: pixels.
 
     Returns:
@@ -29,15 +24,15 @@ def score_poses(
     """
     # The hottest loop of RANSAC: few passes over (B, S, N) numbers, in place. Masks are numbers, as comparisons to
     # bool and masked writes take a CPU ten times as long. Products are written out for the reason given in
-    # :func:`reprojection_errors`.
-    points = points_model.transpose(1, 2).contiguous().unsqueeze(2).unbind(1)
-    observed = points_image.transpose(1, 2).contiguous().unsqueeze(2).unbind(1)
-    counts = valid.unsqueeze(1).to(T.dtype)
+    # :func:`~foundpose.pnp.cost.reprojection_errors`.
+    points = problem.points_model.transpose(1, 2).contiguous().unsqueeze(2).unbind(1)
+    observed = problem.points_image.transpose(1, 2).contiguous().unsqueeze(2).unbind(1)
+    counts = problem.valid.unsqueeze(1).to(T.dtype)
     rows = T.shape[1]
     if T.device.type == "cpu":
-        rows = max(1, _CPU_NUMBERS_PER_BLOCK // max(1, valid.numel()))
-    blocks = [_score_block(block, points, observed, K, counts, threshold) for block in T.split(rows, dim=1)]
-    return torch.cat(blocks, dim=1)
+        rows = max(1, _CPU_NUMBERS_PER_BLOCK // max(1, counts.numel()))
+    parts = points, observed, problem.K, counts, threshold
+    return torch.cat([_score_block(block, *parts) for block in T.split(rows, dim=1)], dim=1)
 
 
 def _score_block(
@@ -77,57 +72,3 @@ def _affine(row: Tensor, points: Sequence[Tensor], buffer: Tensor) -> Tensor:
     for i in (1, 2):
         total.add_(torch.mul(row[..., i : i + 1], points[i], out=buffer))
     return total.add_(row[..., 3:])
-
-
-def select_inliers(
-    T: Tensor,
-    points_image: Tensor,
-    points_model: Tensor,
-    K: Tensor,
-    valid: Tensor,
-    threshold: float,
-    weights: Tensor | None = None,
-    loss: RobustLoss | None = None,
-) -> tuple[Tensor, Tensor]:
-    """Inliers (B, N) of one pose (B, 4, 4) per problem, and its truncated cost (B,) in px²; constants.
-
-    The truncated cost counts an inlier by its loss and all others by the loss at the threshold. The polish on
-    the inliers never raises it, while it may well lose an inlier of a pose that was chosen for having many:
-    the winner of hundreds of samples tends to bend towards a few outliers.
-    """
-    squared, depth = reprojection_errors(T.detach(), points_image.detach(), points_model.detach(), K.detach())
-    inliers = (squared <= threshold**2) & (depth > 0) & valid
-    truncated = torch.where(inliers, squared, torch.full_like(squared, threshold**2))
-    cost = truncated if loss is None else loss(truncated)[0].detach()
-    return inliers, (cost if weights is None else cost * weights.detach()).sum(-1)
-
-
-def reprojection_errors(
-    T: Tensor, points_image: Tensor, points_model: Tensor, K: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Squared pixel distances and depths of projected points.
-
-    Products and sums are written out: matrix routines may round differently for another amount of padding or
-    another batch size, which could turn an inlier at the threshold into an outlier.
-
-    Args:
-        T: (..., 4, 4) poses.
-        points_image: (..., N, 2) pixels.
-        points_model: (..., N, 3).
-        K: (..., 3, 3); leading dimensions broadcast.
-
-    Returns:
-        Squared distances (..., N), px², and depths (..., N), mesh units. Where the depth is not positive the
-        distance means nothing. Differentiable w.r.t. all tensors.
-    """
-    x, y, z = points_model.unbind(-1)
-    R, t = T[..., :3, :3, None], T[..., :3, 3, None]
-    x, y, depth = (
-        R[..., i, 0, :] * x + R[..., i, 1, :] * y + R[..., i, 2, :] * z + t[..., i, :] for i in range(3)
-    )
-    inverse = 1.0 / torch.where(depth > 0, depth, torch.ones_like(depth))
-    x, y = x * inverse, y * inverse
-    M = K[..., None]
-    u = M[..., 0, 0, :] * x + M[..., 0, 1, :] * y + (M[..., 0, 2, :] - points_image[..., 0])
-    v = M[..., 1, 0, :] * x + M[..., 1, 1, :] * y + (M[..., 1, 2, :] - points_image[..., 1])
-    return u * u + v * v, depth

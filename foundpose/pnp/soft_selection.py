@@ -5,7 +5,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from foundpose.pnp.scoring import reprojection_errors
+from foundpose.pnp.cost import reprojection_errors
+from foundpose.pnp.problem import PnpProblem
 
 
 class PoseCandidates(NamedTuple):
@@ -62,43 +63,27 @@ class SoftInlierSelection(nn.Module):
         self.temperature = temperature
 
     def forward(
-        self,
-        T_camera_from_model: Tensor,
-        found: Tensor,
-        points_image: Tensor,
-        points_model: Tensor,
-        K: Tensor,
-        valid: Tensor,
-        threshold: float,
-        weights: Tensor | None = None,
+        self, T_camera_from_model: Tensor, found: Tensor, problem: PnpProblem, threshold: float
     ) -> PoseCandidates:
         """Score hypotheses.
 
         Args:
             T_camera_from_model: (B, J, 4, 4).
             found: (B, J) bool, which of them exist.
-            points_image: (B, N, 2) pixels, finite.
-            points_model: (B, N, 3), finite.
-            K: (B, 3, 3).
-            valid: (B, N) bool.
+            problem: B clean problems.
             threshold: error that counts half, pixels.
-            weights: (B, N), how much each correspondence counts; None means one.
 
         Returns:
-            The candidates. Differentiable w.r.t. the poses, the points, ``K`` and ``weights``.
+            The candidates. Differentiable w.r.t. the poses, and the problem's points, ``K`` and weights.
         """
-        squared, depth = reprojection_errors(
-            T_camera_from_model, points_image.unsqueeze(1), points_model.unsqueeze(1), K.unsqueeze(1)
-        )
-        counted = valid.unsqueeze(1) & (depth > 0) & found.unsqueeze(-1)
+        squared, depth = reprojection_errors(T_camera_from_model, problem)
+        counted = problem.valid.unsqueeze(1) & (depth > 0) & found.unsqueeze(-1)
         # A root at zero has no slope, and an error far beyond the threshold may overflow: both count a constant.
         limit = threshold + 50.0 / self.sharpness
         near = counted & (squared < limit**2) & (squared > 0)
         error = torch.where(near, squared, torch.ones_like(squared)).sqrt()
         error = torch.where(near, error, torch.where(squared > 0, limit, 0.0))
-        share = torch.sigmoid(self.sharpness * (threshold - error))
-        if weights is not None:
-            share = share * weights.unsqueeze(1)
+        share = torch.sigmoid(self.sharpness * (threshold - error)) * problem.weights.unsqueeze(1)
         score = torch.where(counted, share, torch.zeros_like(share)).sum(-1)
         return choose_softly(T_camera_from_model, score, found, self.temperature)
 

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from foundpose.geometry import PatchGrid
 from foundpose.optimization import BarronLoss, Huber, NormalEquations, RobustLoss
-from foundpose.pnp.polish import LocalFrame, project_in_frame
+from foundpose.optimization.local_frame import LocalFrame
 from foundpose.refinement.interpolation import Interpolation, sample_features
 
 ResidualKind = Literal["channel", "norm"]
@@ -146,7 +146,7 @@ class FeaturemetricCost:
         """Residuals of patches and their slopes along columns and rows of the map (n, P, 3, d), which patches are
         seen (n, P), and derivatives of the map's coordinates in the pose (n, 6, 2, P)."""
         maps, problem = self.problem.maps, self.problem
-        pixels, depth, J = project_in_frame(T_local, self.points_local, problem.K, self.frame)
+        pixels, depth, J = self.frame.project(T_local, self.points_local, problem.K)
         inside = ((pixels >= -0.5) & (pixels <= maps.image_size - 0.5)).all(1)
         seen = problem.valid & (depth > 0) & inside
         pixels = torch.where(seen.unsqueeze(1), pixels, torch.zeros_like(pixels))

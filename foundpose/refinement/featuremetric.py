@@ -6,14 +6,13 @@ import torch
 from torch import Tensor, nn
 
 from foundpose.optimization import BarronLoss, Differentiation, Huber, RobustLoss, optimise_pose
-from foundpose.optimization.cholesky import scaled_cholesky
+from foundpose.optimization.covariance import pose_covariance, residual_variance
 from foundpose.optimization.implicit import check_differentiation
-from foundpose.pnp.polish import LocalFrame
+from foundpose.optimization.local_frame import LocalFrame
 from foundpose.refinement.cost import (
     AlignmentProblem,
     AutoScale,
     FeaturemetricCost,
-    Linearisation,
     ResidualKind,
 )
 from foundpose.refinement.interpolation import Interpolation
@@ -184,6 +183,7 @@ class FeaturemetricAlignment(nn.Module):
         T_final = torch.where(improved[:, None, None], T_aligned, T_kept)
         # The equations have the half of the mean of ρ.
         least = 2.0 * result.cost
+        variance = residual_variance(seen.energy, seen.weights * cost.count - 6.0)
         return Alignment(
             T_crop_from_model=T_final,
             cost=least,
@@ -192,7 +192,7 @@ class FeaturemetricAlignment(nn.Module):
             iterations=result.iterations,
             converged=result.converged,
             failed=result.failed,
-            covariance=_covariance(seen, cost.count, frame),
+            covariance=pose_covariance(seen.equations.H, variance, frame),
         )
 
     def residual_size(self) -> str:
@@ -208,15 +208,3 @@ class FeaturemetricAlignment(nn.Module):
             f"interpolation={self.interpolation!r}, max_iterations={self.max_iterations}, "
             f"tolerance={self.tolerance}, differentiation={self.differentiation!r}"
         )
-
-
-def _covariance(seen: Linearisation, count: Tensor, frame: LocalFrame) -> Tensor:
-    """Covariance (n, 6, 6) in the crop's frame from the equations of the mean over so many patches."""
-    H = seen.equations.H
-    system = scaled_cholesky(H, H.diagonal(dim1=-2, dim2=-1))
-    freedom = seen.weights * count - 6.0
-    variance = seen.energy / freedom.clamp(min=torch.finfo(H.dtype).eps)
-    to_crop = frame.twist_to_camera()
-    covariance = variance[:, None, None] * (to_crop @ system.inverse() @ to_crop.transpose(-1, -2))
-    unknown = torch.diag_embed(torch.full_like(H[:, 0], torch.inf))
-    return torch.where((system.usable & (freedom > 0.5))[:, None, None], covariance, unknown)

@@ -24,7 +24,7 @@ PACKAGE = Path(foundpose.__file__).parent
 MAY_READ = {
     "optimization/levenberg_marquardt.py:levenberg_marquardt",
     "pnp/sampling.py:sample_hypotheses",
-    "pnp/ransac.py:_climb",
+    "pnp/local_optimization.py:_climb",
     "pipeline/query.py:select_query_patches",
 }
 READS = {"_local_scalar_dense", "nonzero", "masked_select", "equal", "is_nonzero", "_unique2"}

@@ -6,7 +6,7 @@ import torch
 from kornia.geometry import solve_pnp_dlt
 
 from foundpose.geometry.cameras import pixel_rays
-from foundpose.pnp import PnpStatus, RansacPnp
+from foundpose.pnp import PnpProblem, PnpStatus, RansacPnp
 from foundpose.pnp.dlt import solve_dlt_minimal
 from tests.pnp.scenes import make_scene, pose_errors, stack
 
@@ -57,7 +57,7 @@ def test_in_ransac(dtype):
         outliers = rng.permutation(80)[:24]
         image[outliers] = rng.uniform(0.0, 420.0, (24, 2))
         scenes.append(scene._replace(points_image=image))
-    result = RansacPnp("dlt")(*stack(scenes, dtype))
+    result = RansacPnp("dlt")(PnpProblem(*stack(scenes, dtype)))
     angle, distance = pose_errors(result.T_camera_from_model, scenes)
     assert result.success.all()
     assert ((angle < 5.0) & (distance < 0.05)).mean() >= 0.9
@@ -66,7 +66,7 @@ def test_in_ransac(dtype):
 def test_too_few_and_flat():
     rng = np.random.default_rng(2)
     few, flat = make_scene(rng, 5), make_scene(rng, 40, "plane")
-    result = RansacPnp("dlt", mirror=False)(*stack([few, flat], torch.float64))
+    result = RansacPnp("dlt", mirror=False)(PnpProblem(*stack([few, flat], torch.float64)))
     assert result.status.tolist() == [PnpStatus.TOO_FEW_CORRESPONDENCES, PnpStatus.DEGENERATE]
     with pytest.raises(ValueError, match="min_inliers must be at least 6, got 4"):
         RansacPnp("dlt", min_inliers=4)

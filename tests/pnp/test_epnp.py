@@ -4,10 +4,16 @@ import pytest
 import torch
 from torch import Tensor
 
-from foundpose.pnp import MinimalSolution, polish_pnp, solve_epnp
+from foundpose.pnp import LevenbergMarquardtPnp, MinimalSolution, PnpProblem, solve_epnp
 from tests.pnp.scenes import make_scene, pose_errors, stack
 
 SHAPES = ["volume", "ellipsoid", "plane"]
+
+
+def polished(solution: MinimalSolution, problem: PnpProblem, iterations: int = 20) -> Tensor:
+    return LevenbergMarquardtPnp(max_iterations=iterations)(
+        solution.T_camera_from_model, problem
+    ).T_camera_from_model
 
 
 def scenes_of(count: int, points: int, shape: str, wide: bool, seed: int = 0):
@@ -21,7 +27,7 @@ def scenes_of(count: int, points: int, shape: str, wide: bool, seed: int = 0):
 def test_recovers_known_poses(points: int, shape: str, wide: bool) -> None:
     scenes = scenes_of(200, points, shape, wide)
     image, model, K, _ = stack(scenes, torch.float64)
-    solution = solve_epnp(image, model, K)
+    solution = solve_epnp(PnpProblem(image, model, K))
     angle, distance = pose_errors(solution.T_camera_from_model, scenes)
     assert solution.valid.all()
     assert not solution.degenerate.any()
@@ -35,8 +41,8 @@ def test_recovers_known_poses(points: int, shape: str, wide: bool) -> None:
 def test_recovers_known_poses_from_four_and_five_points(points: int, shape: str, wide: bool) -> None:
     scenes = scenes_of(300, points, shape, wide)
     image, model, K, _ = stack(scenes, torch.float64)
-    solution = solve_epnp(image, model, K)
-    T = polish_pnp(solution.T_camera_from_model, image, model, K, max_iterations=20)[0].T
+    solution = solve_epnp(PnpProblem(image, model, K))
+    T = polished(solution, PnpProblem(image, model, K))
     angle, distance = pose_errors(T, scenes)
     assert ((np.radians(angle) < 1e-6) & (distance < 1e-6)).mean() >= 0.95
 
@@ -46,11 +52,11 @@ def test_recovers_known_poses_from_four_and_five_points(points: int, shape: str,
 def test_float32(points: int, shape: str) -> None:
     scenes = scenes_of(200, points, shape, False)
     image, model, K, _ = stack(scenes, torch.float32)
-    solution = solve_epnp(image, model, K)
+    solution = solve_epnp(PnpProblem(image, model, K))
     assert solution.T_camera_from_model.dtype == torch.float32
     angle, distance = pose_errors(solution.T_camera_from_model, scenes)
     assert ((angle < 0.5) & (distance < 2e-3)).mean() >= 0.9
-    T = polish_pnp(solution.T_camera_from_model, image, model, K, max_iterations=20)[0].T
+    T = polished(solution, PnpProblem(image, model, K))
     angle, distance = pose_errors(T, scenes)
     assert ((angle < 0.01) & (distance < 1e-5)).mean() >= 0.95
 
@@ -64,7 +70,7 @@ def test_no_worse_than_opencvs_epnp_under_noise(points: int, shape: str) -> None
         s._replace(points_image=s.points_image + 1.5 * rng.normal(size=s.points_image.shape)) for s in scenes
     ]
     image, model, K, _ = stack(scenes, torch.float32)
-    ours, _ = pose_errors(solve_epnp(image, model, K).T_camera_from_model, scenes)
+    ours, _ = pose_errors(solve_epnp(PnpProblem(image, model, K)).T_camera_from_model, scenes)
     reference = []
     for s in scenes:
         _, rotation, translation = cv2.solvePnP(
@@ -81,28 +87,22 @@ def test_no_worse_than_opencvs_epnp_under_noise(points: int, shape: str) -> None
 def test_weights_select_a_subset() -> None:
     scenes = scenes_of(50, 12, "volume", False)
     image, model, K, _ = stack(scenes, torch.float64)
-    subset = solve_epnp(image[:, :7], model[:, :7], K)
+    subset = solve_epnp(PnpProblem(image[:, :7], model[:, :7], K))
     image[:, 7:] += 50.0
     image[0, 8], model[1, 9] = torch.nan, torch.inf
     weights = torch.zeros(50, 12, dtype=torch.float64)
     weights[:, :7] = 3.0
     for w in (weights, weights > 0):
-        masked = solve_epnp(image, model, K, w)
+        masked = solve_epnp(PnpProblem(image, model, K, weights=w))
         assert masked.valid.all()
         torch.testing.assert_close(
             masked.T_camera_from_model, subset.T_camera_from_model, rtol=1e-7, atol=1e-6
         )
     # Four weighted points among padding are solved as well.
     weights[:, 4:] = 0.0
-    four = solve_epnp(image, model, K, weights)
-    T = polish_pnp(
-        four.T_camera_from_model,
-        image.nan_to_num(),
-        model.nan_to_num(posinf=0.0),
-        K,
-        weights,
-        max_iterations=20,
-    )[0].T
+    four = solve_epnp(PnpProblem(image, model, K, weights=weights))
+    known = image.nan_to_num(), model.nan_to_num(posinf=0.0), K
+    T = polished(four, PnpProblem(*known, weights=weights))
     assert (pose_errors(T, scenes)[0] < 1e-4).mean() >= 0.95
 
 
@@ -115,8 +115,10 @@ def test_weights_downweight() -> None:
     ]
     image, model, K, _ = stack(scenes, torch.float64)
     weights = torch.from_numpy(sigma**-2.0).expand(100, 30)
-    plain, _ = pose_errors(solve_epnp(image, model, K).T_camera_from_model, scenes)
-    weighted, _ = pose_errors(solve_epnp(image, model, K, weights).T_camera_from_model, scenes)
+    plain, _ = pose_errors(solve_epnp(PnpProblem(image, model, K)).T_camera_from_model, scenes)
+    weighted, _ = pose_errors(
+        solve_epnp(PnpProblem(image, model, K, weights=weights)).T_camera_from_model, scenes
+    )
     assert np.median(weighted) < 0.2 * np.median(plain)
 
 
@@ -124,7 +126,7 @@ def test_weights_downweight() -> None:
 @pytest.mark.parametrize("points", [4, 5, 9])
 def test_degenerate_samples_are_flagged_among_good_ones(points: int, dtype: torch.dtype) -> None:
     image, model, K, _ = stack(scenes_of(7, points, "volume", False), dtype)
-    clean = solve_epnp(image, model, K)
+    clean = solve_epnp(PnpProblem(image, model, K))
     line = torch.linspace(-1, 1, points, dtype=dtype)[:, None] * torch.tensor(
         [50.0, -30.0, 20.0], dtype=dtype
     )
@@ -137,7 +139,7 @@ def test_degenerate_samples_are_flagged_among_good_ones(points: int, dtype: torc
         model[5, 3] = model[5, 1]
     weights = torch.ones(7, points, dtype=dtype)
     weights[6, 3:] = 0.0
-    solution = solve_epnp(image, model, K, weights)
+    solution = solve_epnp(PnpProblem(image, model, K, weights=weights))
     assert torch.isfinite(solution.T_camera_from_model).all()
     expected = [False, True, True, points == 4, True, points == 4, True]
     assert solution.degenerate.tolist() == expected
@@ -150,7 +152,7 @@ def test_points_behind_the_camera_are_never_valid(points: int) -> None:
     """Images of points behind the camera look like images of mirrored objects; no valid pose explains them."""
     scenes = scenes_of(200, points, "volume", True)
     image, model, K, _ = stack([s._replace(points_image=419 - s.points_image) for s in scenes], torch.float64)
-    solution = solve_epnp(image, model, K)
+    solution = solve_epnp(PnpProblem(image, model, K))
     camera = model @ solution.T_camera_from_model[:, :3, :3].mT + solution.T_camera_from_model[:, None, :3, 3]
     assert (camera[solution.valid][..., 2] > 0).all()
 
@@ -159,10 +161,12 @@ def test_batch_independence() -> None:
     scenes = scenes_of(20, 9, "volume", False)
     image, model, K, _ = stack(scenes, torch.float64)
     for n in (4, 9):
-        together = solve_epnp(image[:, :n], model[:, :n], K).T_camera_from_model
+        together = solve_epnp(PnpProblem(image[:, :n], model[:, :n], K)).T_camera_from_model
         alone = torch.cat(
             [
-                solve_epnp(image[i : i + 1, :n], model[i : i + 1, :n], K[i : i + 1]).T_camera_from_model
+                solve_epnp(
+                    PnpProblem(image[i : i + 1, :n], model[i : i + 1, :n], K[i : i + 1])
+                ).T_camera_from_model
                 for i in range(20)
             ]
         )
@@ -178,18 +182,19 @@ def test_skewed_camera_with_two_focal_lengths() -> None:
         image = (s.points_model @ s.R.T + s.t) @ K.T
         skewed.append(s._replace(K=K, points_image=image[:, :2] / image[:, 2:]))
     image, model, K, _ = stack(skewed, torch.float64)
-    T = solve_epnp(image, model, K).T_camera_from_model
+    solution = solve_epnp(PnpProblem(image, model, K))
+    T = solution.T_camera_from_model
     angle, _ = pose_errors(T, scenes)
     assert angle.max() < 1e-5
-    polished = polish_pnp(T, image, model, K)[0]
-    assert pose_errors(polished.T, scenes)[0].max() < 1e-9
+    T = polished(solution, PnpProblem(image, model, K), 10)
+    assert pose_errors(T, scenes)[0].max() < 1e-9
 
 
 def test_gradients_are_finite() -> None:
     image, model, K, _ = stack(scenes_of(10, 8, "volume", False), torch.float64)
     for n in (4, 8):
         inputs = [x.clone().requires_grad_() for x in (image[:, :n], model[:, :n], K)]
-        solve_epnp(*inputs).T_camera_from_model.square().sum().backward()
+        solve_epnp(PnpProblem(*inputs)).T_camera_from_model.square().sum().backward()
         for x in inputs:
             assert torch.isfinite(x.grad).all()
             assert x.grad.abs().max() > 0
@@ -198,15 +203,15 @@ def test_gradients_are_finite() -> None:
 def test_bad_input() -> None:
     image, model, K, _ = stack(scenes_of(2, 6, "volume", False), torch.float32)
     with pytest.raises(ValueError, match="at least 4 correspondences, got N = 3"):
-        solve_epnp(image[:, :3], model[:, :3], K)
+        solve_epnp(PnpProblem(image[:, :3], model[:, :3], K))
     with pytest.raises(ValueError, match=r"points_model must have shape \(2, 6, 3\), got \(2, 5, 3\)"):
-        solve_epnp(image, model[:, :5], K)
+        solve_epnp(PnpProblem(image, model[:, :5], K))
     with pytest.raises(ValueError, match=r"K must have shape \(2, 3, 3\).*got \(3, 3\)"):
-        solve_epnp(image, model, K[0])
+        solve_epnp(PnpProblem(image, model, K[0]))
     with pytest.raises(ValueError, match=r"weights must have shape \(2, 6\)"):
-        solve_epnp(image, model, K, torch.ones(2, 5))
+        solve_epnp(PnpProblem(image, model, K, weights=torch.ones(2, 5)))
     with pytest.raises(ValueError, match="float16"):
-        solve_epnp(image.half(), model.half(), K.half())
+        solve_epnp(PnpProblem(image.half(), model.half(), K.half()))
 
 
 def noisy_problem(points: int, shape: str, seed: int, sigma: float = 0.1) -> list[Tensor]:
@@ -238,7 +243,9 @@ def test_gradients_agree_with_finite_differences(points: int, shape: str) -> Non
 
     def pose(image: Tensor, moved: Tensor, parameters: Tensor, weights: Tensor | None = None) -> Tensor:
         points_model = torch.cat([moved, model[..., moving:]], dim=-1)
-        return solve_epnp(image, points_model, intrinsics(parameters), weights).T_camera_from_model[:, :3]
+        return solve_epnp(
+            PnpProblem(image, points_model, intrinsics(parameters), weights=weights)
+        ).T_camera_from_model[:, :3]
 
     # The refinement stops after five steps, so the gradient of the optimum differs a little from that of the steps.
     def check(inputs: list[Tensor]) -> bool:
@@ -260,7 +267,9 @@ def test_most_gradients_agree_with_finite_differences_under_noise(points: int, s
     cotangent = torch.randn(200, 3, 3, generator=g, dtype=torch.float64)
 
     def values(image: Tensor) -> Tensor:
-        return (solve_epnp(image, model, K).T_camera_from_model[:, :3, :3] * cotangent).sum((1, 2))
+        return (solve_epnp(PnpProblem(image, model, K)).T_camera_from_model[:, :3, :3] * cotangent).sum(
+            (1, 2)
+        )
 
     image.requires_grad_()
     (grad,) = torch.autograd.grad(values(image).sum(), image)
@@ -350,7 +359,7 @@ def hard_case(name: str, points: int, dtype: torch.dtype) -> tuple[list[Tensor],
 
 def gradients(inputs: list[Tensor]) -> tuple[MinimalSolution, list[Tensor]]:
     inputs = [x.clone().requires_grad_() for x in inputs]
-    solution = solve_epnp(*inputs)
+    solution = solve_epnp(PnpProblem(*inputs[:3], weights=inputs[3]))
     T = solution.T_camera_from_model
     factors = torch.linspace(0.5, 2.0, 16, dtype=T.dtype).view(4, 4)
     grads = torch.autograd.grad((T * factors).sum(), inputs, allow_unused=True)
@@ -397,6 +406,6 @@ def test_gradients_do_not_depend_on_neighbours(points: int, dtype: torch.dtype) 
 @pytest.mark.parametrize("points", [4, 5, 9])
 def test_gradients_do_not_change_values(points: int) -> None:
     image, model, K, _ = stack(scenes_of(100, points, "volume", False), torch.float32)
-    plain = solve_epnp(image, model, K).T_camera_from_model
+    plain = solve_epnp(PnpProblem(image, model, K)).T_camera_from_model
     assert not plain.requires_grad
-    assert torch.equal(solve_epnp(image.requires_grad_(), model, K).T_camera_from_model, plain)
+    assert torch.equal(solve_epnp(PnpProblem(image.requires_grad_(), model, K)).T_camera_from_model, plain)

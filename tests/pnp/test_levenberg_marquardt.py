@@ -10,7 +10,7 @@ from torch import Tensor
 from foundpose.geometry.cameras import project_points
 from foundpose.geometry.transforms import make_transform, rotation_angle, se3_exp, transform_points
 from foundpose.optimization import BarronLoss, Huber
-from foundpose.pnp import LevenbergMarquardtPnp
+from foundpose.pnp import LevenbergMarquardtPnp, PnpProblem
 from tests.pnp.scenes import make_scene, stack
 
 LOSSES = {"least_squares": None, "huber": Huber(3.0), "barron": BarronLoss(0.0, 5.0).double()}
@@ -42,7 +42,9 @@ def perturb(T: Tensor, twist: Tensor) -> Tensor:
 @pytest.mark.parametrize("loss", LOSSES)
 def test_reaches_scipys_optimum(loss: str) -> None:
     image, model, K, weights, T0 = problems(4, 30, noise=2.0)
-    optimum = LevenbergMarquardtPnp(LOSSES[loss], max_iterations=100)(T0, image, model, K, weights)
+    optimum = LevenbergMarquardtPnp(LOSSES[loss], max_iterations=100)(
+        T0, PnpProblem(image, model, K, weights=weights)
+    )
     assert optimum.converged.all()
     assert (optimum.cost <= optimum.initial_cost).all()
     scale = {"huber": 3.0, "barron": 5.0, "least_squares": 1.0}[loss]
@@ -74,7 +76,7 @@ def pose_function(mode: str, loss, T0: Tensor):
     module = LevenbergMarquardtPnp(loss, max_iterations=150, tolerance=0.0, differentiation=mode)
 
     def run(image: Tensor, model: Tensor, K: Tensor, weights: Tensor) -> Tensor:
-        T = module(T0, image, model, K, weights).T_camera_from_model
+        T = module(T0, PnpProblem(image, model, K, weights=weights)).T_camera_from_model
         # Translations in units of the distance, so that one tolerance suits all entries.
         return torch.cat([T[:, :3, :3], T[:, :3, 3:] / T0[:, 2:3, 3:]], dim=-1)
 
@@ -112,7 +114,9 @@ def test_unrolled_gradient_of_the_start() -> None:
 
     def run(twist: Tensor, mode: str = "unrolled") -> Tensor:
         module = LevenbergMarquardtPnp(max_iterations=2, tolerance=0.0, differentiation=mode)
-        return module(se3_exp(twist) @ T0, image, model, K, weights).T_camera_from_model[:, :3]
+        return module(se3_exp(twist) @ T0, PnpProblem(image, model, K, weights=weights)).T_camera_from_model[
+            :, :3
+        ]
 
     twist = torch.zeros(1, 6, dtype=torch.float64, requires_grad=True)
     (gradient,) = torch.autograd.grad(run(twist).sum(), twist)
@@ -132,7 +136,7 @@ def test_gradient_of_the_loss_parameters() -> None:
 
     def rotation() -> Tensor:
         return LevenbergMarquardtPnp(loss, 300, tolerance=0.0)(
-            T0, image, model, K, weights
+            T0, PnpProblem(image, model, K, weights=weights)
         ).T_camera_from_model[0, 0, 1]
 
     gradient = torch.autograd.grad(rotation(), list(loss.parameters()))
@@ -157,9 +161,7 @@ def test_covariance_against_monte_carlo(noise: float | None) -> None:
     with torch.no_grad():
         optimum = module(
             T.expand(trials, 4, 4),
-            image + 1.5 * draws,
-            model.expand(trials, -1, -1),
-            K.expand(trials, 3, 3),
+            PnpProblem(image + 1.5 * draws, model.expand(trials, -1, -1), K.expand(trials, 3, 3)),
         )
     # δ with exp(δ) T_true = T, to first order.
     delta = optimum.T_camera_from_model @ torch.linalg.inv(T)
@@ -179,28 +181,34 @@ def test_covariance_scales_with_weights_and_says_when_there_is_none() -> None:
     image, model, K, _, T0 = problems(1, 12, noise=1.0)
     weights = torch.ones(1, 12, dtype=torch.float64)
     known = LevenbergMarquardtPnp(noise=1.0)
-    once = known(T0, image, model, K, weights).covariance
+    once = known(T0, PnpProblem(image, model, K, weights=weights)).covariance
     torch.testing.assert_close(
-        known(T0, image, model, K, 4 * weights).covariance, once / 4, rtol=1e-6, atol=0
+        known(T0, PnpProblem(image, model, K, weights=4 * weights)).covariance, once / 4, rtol=1e-6, atol=0
     )
     estimated = LevenbergMarquardtPnp()
-    a, b = (estimated(T0, image, model, K, s * weights).covariance for s in (1, 4))
+    a, b = (estimated(T0, PnpProblem(image, model, K, weights=s * weights)).covariance for s in (1, 4))
     torch.testing.assert_close(a, b, rtol=1e-6, atol=0)
     # Three points determine the pose but leave nothing to estimate the noise from; two do not even do that.
     weights[:, 3:] = 0.0
-    assert torch.isinf(estimated(T0, image, model, K, weights).covariance.diagonal(dim1=1, dim2=2)).all()
-    assert torch.isfinite(known(T0, image, model, K, weights).covariance).all()
+    assert torch.isinf(
+        estimated(T0, PnpProblem(image, model, K, weights=weights)).covariance.diagonal(dim1=1, dim2=2)
+    ).all()
+    assert torch.isfinite(known(T0, PnpProblem(image, model, K, weights=weights)).covariance).all()
     weights[:, 2:] = 0.0
-    assert torch.isinf(known(T0, image, model, K, weights).covariance.diagonal(dim1=1, dim2=2)).all()
+    assert torch.isinf(
+        known(T0, PnpProblem(image, model, K, weights=weights)).covariance.diagonal(dim1=1, dim2=2)
+    ).all()
 
 
 def test_covariance_of_a_robust_loss_counts_the_outliers_out() -> None:
     image, model, K, _, T0 = problems(1, 40, noise=1.0, seed=2)
     spoilt = image.clone()
     spoilt[:, :8] += 200.0
-    clean = LevenbergMarquardtPnp()(T0, image, model, K).covariance.diagonal(dim1=1, dim2=2).sqrt()
-    robust = LevenbergMarquardtPnp(BarronLoss(-5.0, 3.0).double(), 100)(T0, spoilt, model, K)
-    plain = LevenbergMarquardtPnp(max_iterations=100)(T0, spoilt, model, K)
+    clean = (
+        LevenbergMarquardtPnp()(T0, PnpProblem(image, model, K)).covariance.diagonal(dim1=1, dim2=2).sqrt()
+    )
+    robust = LevenbergMarquardtPnp(BarronLoss(-5.0, 3.0).double(), 100)(T0, PnpProblem(spoilt, model, K))
+    plain = LevenbergMarquardtPnp(max_iterations=100)(T0, PnpProblem(spoilt, model, K))
     assert (robust.covariance.diagonal(dim1=1, dim2=2).sqrt() / clean < 2.0).all()
     assert (plain.covariance.diagonal(dim1=1, dim2=2).sqrt() / clean > 5.0).all()
 
@@ -244,7 +252,7 @@ def test_gradients_are_finite_at_hard_cases(case: str, mode: str, dtype: torch.d
         start[:] = math.nan
     inputs = [x.to(dtype).requires_grad_() for x in (image, model, K, weights)]
     module = LevenbergMarquardtPnp(differentiation=mode)
-    optimum = module(start.to(dtype), *inputs)
+    optimum = module(start.to(dtype), PnpProblem(*inputs[:3], weights=inputs[3]))
     angle = optimum.T_camera_from_model[:, :3].square().sum()
     gradients = torch.autograd.grad(angle, inputs, allow_unused=True)
     for gradient in gradients:
@@ -265,7 +273,7 @@ def pose_gradient(T: Tensor, inputs: list[Tensor]) -> Tensor:
     module = LevenbergMarquardtPnp(max_iterations=50, tolerance=0.0, differentiation="unrolled")
     # Steps have to be taken: an exact fit would stay where it is.
     twist = torch.tensor([[3.0, -2.0, 4.0, 0.03, -0.02, 0.01]], dtype=torch.float64)
-    T = module(perturb(T, twist), image, *inputs[1:]).T_camera_from_model
+    T = module(perturb(T, twist), PnpProblem(image, *inputs[1:3], weights=inputs[3])).T_camera_from_model
     return torch.autograd.grad(T[:, :3].square().sum(), image)[0]
 
 
@@ -273,11 +281,13 @@ def test_gradients_do_not_depend_on_the_batch() -> None:
     image, model, K, weights, T0 = problems(5, 15, noise=3.0, seed=4)
     weights[2] = 0.0  # a hopeless neighbour
     leaves = [x.clone().requires_grad_() for x in (image, model, K, weights)]
-    T = LevenbergMarquardtPnp()(T0, *leaves).T_camera_from_model
+    T = LevenbergMarquardtPnp()(T0, PnpProblem(*leaves[:3], weights=leaves[3])).T_camera_from_model
     together = torch.autograd.grad(T[:, :3].square().sum(), leaves)
     for b in range(5):
         alone_leaves = [x[b : b + 1].clone().requires_grad_() for x in (image, model, K, weights)]
-        alone_T = LevenbergMarquardtPnp()(T0[b : b + 1], *alone_leaves).T_camera_from_model
+        alone_T = LevenbergMarquardtPnp()(
+            T0[b : b + 1], PnpProblem(*alone_leaves[:3], weights=alone_leaves[3])
+        ).T_camera_from_model
         assert torch.equal(alone_T[0], T[b])
         alone = torch.autograd.grad(alone_T[:, :3].square().sum(), alone_leaves, allow_unused=True)
         for one, many in zip(alone, together, strict=True):
@@ -313,10 +323,12 @@ def test_hopeless_neighbours_disturb_nobody(case: str, mode: str, dtype: torch.d
         points = image[rows].clone().requires_grad_()
         optimum = module(
             T0[rows],
-            points,
-            model[rows],
-            K[rows] + (shared[0] - K[:1]).expand(count, 3, 3),
-            weights[rows] * (1 + (shared[1] - weights[:1])),
+            PnpProblem(
+                points,
+                model[rows],
+                K[rows] + (shared[0] - K[:1]).expand(count, 3, 3),
+                weights=weights[rows] * (1 + (shared[1] - weights[:1])),
+            ),
         )
         assert torch.isfinite(optimum.T_camera_from_model).all()
         value = optimum.T_camera_from_model[:1, :3].square().sum()
@@ -337,7 +349,9 @@ def test_hopeless_neighbours_disturb_nobody(case: str, mode: str, dtype: torch.d
 def test_a_failed_pose_has_no_covariance() -> None:
     image, model, K, weights, T0 = problems(2, 10)
     T0[1, 2, 3] = -T0[1, 2, 3]
-    optimum = LevenbergMarquardtPnp(noise=1.0)(T0, image.requires_grad_(), model, K, weights)
+    optimum = LevenbergMarquardtPnp(noise=1.0)(
+        T0, PnpProblem(image.requires_grad_(), model, K, weights=weights)
+    )
     assert optimum.failed.tolist() == [False, True]
     assert optimum.regular.tolist() == [True, False]
     assert torch.isinf(optimum.covariance[1].diagonal()).all()
@@ -349,12 +363,14 @@ def test_padding_has_no_influence() -> None:
     garbage = torch.full((2, 4, 3), 1e3, dtype=torch.float64)
     padded = LevenbergMarquardtPnp()(
         T0,
-        torch.cat([image, garbage[..., :2]], 1),
-        torch.cat([model, garbage], 1),
-        K,
-        torch.cat([weights, torch.zeros(2, 4, dtype=torch.float64)], 1),
+        PnpProblem(
+            torch.cat([image, garbage[..., :2]], 1),
+            torch.cat([model, garbage], 1),
+            K,
+            weights=torch.cat([weights, torch.zeros(2, 4, dtype=torch.float64)], 1),
+        ),
     )
-    plain = LevenbergMarquardtPnp()(T0, image, model, K, weights)
+    plain = LevenbergMarquardtPnp()(T0, PnpProblem(image, model, K, weights=weights))
     torch.testing.assert_close(padded.T_camera_from_model, plain.T_camera_from_model, rtol=1e-9, atol=1e-7)
     torch.testing.assert_close(padded.covariance, plain.covariance, rtol=1e-5, atol=0)
 
@@ -362,8 +378,8 @@ def test_padding_has_no_influence() -> None:
 def test_the_same_with_and_without_gradient() -> None:
     image, model, K, weights, T0 = (x.float() for x in problems(3, 10, noise=2.0))
     with torch.no_grad():
-        plain = LevenbergMarquardtPnp()(T0, image, model, K, weights)
-    graph = LevenbergMarquardtPnp()(T0, image.requires_grad_(), model, K, weights)
+        plain = LevenbergMarquardtPnp()(T0, PnpProblem(image, model, K, weights=weights))
+    graph = LevenbergMarquardtPnp()(T0, PnpProblem(image.requires_grad_(), model, K, weights=weights))
     assert torch.equal(plain.T_camera_from_model, graph.T_camera_from_model)
     assert torch.equal(plain.covariance, graph.covariance)
     assert not graph.covariance.requires_grad
@@ -383,7 +399,7 @@ def saved_bytes(mode: str, iterations: int) -> int:
     kept: list[Tensor] = []
     module = LevenbergMarquardtPnp(max_iterations=iterations, tolerance=0.0, differentiation=mode)
     with torch.autograd.graph.saved_tensors_hooks(pack, lambda x: x):
-        optimum = module(T0, image.requires_grad_(), model, K, weights)
+        optimum = module(T0, PnpProblem(image.requires_grad_(), model, K, weights=weights))
     assert optimum.iterations.max() >= min(iterations, 15)
     optimum.T_camera_from_model.sum().backward()
     return sum(seen.values())
@@ -408,4 +424,4 @@ def test_bad_arguments() -> None:
             LevenbergMarquardtPnp(**arguments)
     image, model, K, weights, T0 = problems(2, 10)
     with pytest.raises(ValueError, match=r"weights must have shape \(2, 10\), got \(2, 9\)"):
-        LevenbergMarquardtPnp()(T0, image, model, K, weights[:, :9])
+        LevenbergMarquardtPnp()(T0, PnpProblem(image, model, K, weights=weights[:, :9]))

@@ -8,6 +8,7 @@ from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from foundpose.pnp import PnpProblem
 from foundpose.pnp.p3p import P3PSolutions, solve_p3p, solve_p3p_rays
 from tests.pnp.scenes import Scene, make_scene, stack
 
@@ -45,7 +46,7 @@ def scene_errors(solutions: P3PSolutions, scenes: list[Scene]) -> np.ndarray:
 def test_recovers_known_poses(shape: str, wide: bool) -> None:
     scenes = scenes_of(2000, shape, wide)
     image, model, K, _ = stack(scenes, torch.float64)
-    solutions = solve_p3p(image, model, K)
+    solutions = solve_p3p(PnpProblem(image, model, K))
     assert not solutions.degenerate.any()
     assert (scene_errors(solutions, scenes) < 1e-6).all()
 
@@ -56,12 +57,12 @@ def test_float32(shape: str, share: float, wide: bool) -> None:
     """Points of a plane make thin triangles now and then, whose height their sides hardly tell."""
     scenes = scenes_of(2000, shape, wide)
     image, model, K, _ = stack(scenes, torch.float32)
-    solutions = solve_p3p(image, model, K)
+    solutions = solve_p3p(PnpProblem(image, model, K))
     assert solutions.T_camera_from_model.dtype == torch.float32
     errors = scene_errors(solutions, scenes)
     assert (errors < 1e-4).mean() >= share
     # The rounding of the input alone moves the poses by half as much.
-    exact = solve_p3p(image.double(), model.double(), K.double())
+    exact = solve_p3p(PnpProblem(image.double(), model.double(), K.double()))
     assert np.median(errors) < 3.0 * np.median(scene_errors(exact, scenes))
 
 
@@ -90,7 +91,7 @@ def test_finds_all_roots_that_opencv_finds(wide: bool, mixed_up: bool, flag: int
         rng = np.random.default_rng(1)
         scenes = [s._replace(points_image=rng.uniform(80, 340, (3, 2))) for s in scenes]
     image, model, K, _ = stack(scenes, torch.float64)
-    solutions = solve_p3p(image, model, K)
+    solutions = solve_p3p(PnpProblem(image, model, K))
     counts = set()
     for scene, T, valid in zip(scenes, solutions.T_camera_from_model, solutions.valid, strict=True):
         ours, theirs = T[valid].numpy(), opencv_roots(scene, flag)
@@ -110,7 +111,7 @@ def test_equilateral_triangle_seen_along_its_axis() -> None:
     for depth in (0.5, 2.0, 6.0, 100.0):
         scene = Scene(points, points[:, :2] * 1000.0 / depth, K, np.eye(3), np.array([0.0, 0.0, depth]), 2.0)
         image, model, intrinsics, _ = stack([scene], torch.float64)
-        solutions = solve_p3p(image, model, intrinsics)
+        solutions = solve_p3p(PnpProblem(image, model, intrinsics))
         assert scene_errors(solutions, [scene])[0] < 1e-9
         roots = solutions.T_camera_from_model[solutions.valid].numpy()
         for reference in opencv_roots(scene, cv2.SOLVEPNP_P3P):
@@ -182,7 +183,7 @@ def test_every_valid_root_reprojects(
 ) -> None:
     K = torch.tensor([[[focal, 0.0, 200.0], [0.0, focal, 200.0], [0.0, 0.0, 1.0]]], dtype=dtype)
     image, model = torch.from_numpy(pixels[None]).to(dtype), torch.from_numpy(points[None]).to(dtype)
-    solutions = solve_p3p(image, model, K)
+    solutions = solve_p3p(PnpProblem(image, model, K))
     T, valid = solutions.T_camera_from_model, solutions.valid
     assert torch.isfinite(T).all()
     assert not (valid & solutions.degenerate[:, None]).any()
@@ -201,7 +202,7 @@ def test_every_valid_root_reprojects(
 def test_valid_roots_come_first_by_distance(dtype: torch.dtype) -> None:
     scenes = scenes_of(2000, "ellipsoid", wide=True)
     image, model, K, _ = stack(scenes, dtype)
-    T, valid, _ = solve_p3p(image, model, K)
+    T, valid, _ = solve_p3p(PnpProblem(image, model, K))
     assert not (valid[:, 1:] & ~valid[:, :-1]).any()
     camera = torch.einsum("brij,bj->bri", T[..., :3, :3], model[:, 0]) + T[..., :3, 3]
     distance = camera.norm(dim=-1)
@@ -216,7 +217,7 @@ def test_unit_of_length_does_not_matter(unit: float) -> None:
     scenes = scenes_of(200)
     image, model, K, _ = stack(scenes, torch.float32)
     scaled = [s._replace(t=s.t * unit) for s in scenes]
-    ours = scene_errors(solve_p3p(image, model * unit, K), scaled)
+    ours = scene_errors(solve_p3p(PnpProblem(image, model * unit, K)), scaled)
     assert (ours < 1e-4).mean() >= 0.99
 
 
@@ -241,9 +242,9 @@ def degenerate_batch(dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_degenerate_samples_are_flagged_among_good_ones(dtype: torch.dtype) -> None:
     inputs = degenerate_batch(dtype)
-    clean = solve_p3p(*(x[:1] for x in inputs))
+    clean = solve_p3p(PnpProblem(*(x[:1] for x in inputs)))
     inputs = tuple(x.requires_grad_() for x in inputs)
-    T, valid, degenerate = solve_p3p(*inputs)
+    T, valid, degenerate = solve_p3p(PnpProblem(*inputs))
     assert degenerate.tolist() == [False] + 11 * [True]
     assert not valid[1:].any()
     assert valid[0].any()
@@ -273,13 +274,13 @@ def test_gradients_of_all_roots(shape: str, wide: bool) -> None:
     image, model, K, _ = stack(scenes, torch.float64)
     # Units in which finite differences of one size suit all inputs.
     image, model, K = image / 100.0, model / 100.0, torch.diag(torch.tensor([0.01, 0.01, 1.0]).double()) @ K
-    valid = solve_p3p(image, model, K).valid
+    valid = solve_p3p(PnpProblem(image, model, K)).valid
     assert valid.any(1).all()
 
     def roots(image: Tensor, model: Tensor, intrinsics: Tensor) -> Tensor:
         K = torch.zeros(4, 3, 3, dtype=torch.float64)
         K[:, 0, 0], K[:, 1, 1], K[:, :2, 2], K[:, 2, 2] = *intrinsics[:, :2].T, intrinsics[:, 2:], 1.0
-        return solve_p3p(image, model, K).T_camera_from_model[valid]
+        return solve_p3p(PnpProblem(image, model, K)).T_camera_from_model[valid]
 
     intrinsics = torch.stack([K[:, 0, 0], K[:, 1, 1], K[:, 0, 2], K[:, 1, 2]], dim=-1)
     inputs = [x.clone().requires_grad_() for x in (image, model, intrinsics)]
@@ -288,9 +289,9 @@ def test_gradients_of_all_roots(shape: str, wide: bool) -> None:
 
 def test_gradients_do_not_change_values() -> None:
     image, model, K, _ = stack(scenes_of(100), torch.float32)
-    plain = solve_p3p(image, model, K).T_camera_from_model
+    plain = solve_p3p(PnpProblem(image, model, K)).T_camera_from_model
     assert not plain.requires_grad
-    assert torch.equal(solve_p3p(image.requires_grad_(), model, K).T_camera_from_model, plain)
+    assert torch.equal(solve_p3p(PnpProblem(image.requires_grad_(), model, K)).T_camera_from_model, plain)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -300,7 +301,7 @@ def test_batch_independence(dtype: torch.dtype) -> None:
 
     def solve(samples: slice) -> tuple[Tensor, ...]:
         inputs = [x[samples].clone().requires_grad_() for x in (image, model, K)]
-        solutions = solve_p3p(*inputs)
+        solutions = solve_p3p(PnpProblem(*inputs))
         grads = torch.autograd.grad(solutions.T_camera_from_model.square().sum(), inputs)
         return solutions.T_camera_from_model.detach(), solutions.valid, *grads[:2]
 
@@ -316,7 +317,7 @@ def test_batch_independence(dtype: torch.dtype) -> None:
 
 
 def test_empty_batch() -> None:
-    solutions = solve_p3p(torch.zeros(0, 3, 2), torch.zeros(0, 3, 3), torch.zeros(0, 3, 3))
+    solutions = solve_p3p(PnpProblem(torch.zeros(0, 3, 2), torch.zeros(0, 3, 3), torch.zeros(0, 3, 3)))
     assert solutions.T_camera_from_model.shape == (0, 4, 4, 4)
     assert solutions.valid.shape == (0, 4)
     assert solutions.degenerate.shape == (0,)
@@ -325,12 +326,12 @@ def test_empty_batch() -> None:
 def test_bad_input() -> None:
     image, model, K, _ = stack(scenes_of(2), torch.float32)
     with pytest.raises(ValueError, match="exactly 3 correspondences, got N = 2"):
-        solve_p3p(image[:, :2], model[:, :2], K)
+        solve_p3p(PnpProblem(image[:, :2], model[:, :2], K))
     with pytest.raises(ValueError, match=r"points_image must have shape \(B, N, 2\), got \(3, 2\)"):
-        solve_p3p(image[0], model, K)
+        solve_p3p(PnpProblem(image[0], model, K))
     with pytest.raises(ValueError, match=r"points_model must have shape \(2, 3, 3\), got \(1, 3, 3\)"):
-        solve_p3p(image, model[:1], K)
+        solve_p3p(PnpProblem(image, model[:1], K))
     with pytest.raises(ValueError, match=r"K must have shape \(2, 3, 3\).*got \(3, 3\)"):
-        solve_p3p(image, model, K[0])
+        solve_p3p(PnpProblem(image, model, K[0]))
     with pytest.raises(ValueError, match="float64"):
-        solve_p3p(image, model.double(), K)
+        solve_p3p(PnpProblem(image, model.double(), K))

@@ -6,7 +6,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from foundpose.optimization import Huber
-from foundpose.pnp import LevenbergMarquardtPnp, PnpStatus, RansacPnp, solve_epnp
+from foundpose.pnp import LevenbergMarquardtPnp, PnpProblem, PnpStatus, RansacPnp, solve_epnp
 from foundpose.pnp.sampling import distinct_ranks
 from tests.pnp.scenes import Scene, make_scene, pose_errors, stack
 
@@ -56,7 +56,10 @@ def test_no_worse_than_opencv_on_random_problems() -> None:
     reference = torch.from_numpy(np.stack([opencv_pose(s) for s in scenes]))
     ransac = RansacPnp()
     ours = torch.cat(
-        [ransac(*stack(scenes[i : i + 48], torch.float32)).T_camera_from_model for i in range(0, 576, 48)]
+        [
+            ransac(PnpProblem(*stack(scenes[i : i + 48], torch.float32))).T_camera_from_model
+            for i in range(0, 576, 48)
+        ]
     )
 
     def success(T: torch.Tensor) -> np.ndarray:
@@ -73,7 +76,7 @@ def test_no_worse_than_opencv_on_random_problems() -> None:
 def test_result_is_consistent_with_its_pose() -> None:
     scenes = random_scenes(24, seed=2)
     image, model, K, valid = stack(scenes, torch.float64)
-    result = RansacPnp()(image, model, K, valid)
+    result = RansacPnp()(PnpProblem(image, model, K, valid))
     assert result.success.all()
     assert (result.status == PnpStatus.OK).all()
     for b, scene in enumerate(scenes):
@@ -92,7 +95,7 @@ def test_result_is_consistent_with_its_pose() -> None:
 
 def test_pose_is_scipys_optimum_on_the_inliers() -> None:
     scenes = random_scenes(16, seed=3)
-    result = RansacPnp(polish_rounds=10)(*stack(scenes, torch.float64))
+    result = RansacPnp(polish_rounds=10)(PnpProblem(*stack(scenes, torch.float64)))
     for b, scene in enumerate(scenes):
         chosen = result.inliers[b, : len(scene.points_model)].numpy()
         model, image = scene.points_model[chosen], scene.points_image[chosen]
@@ -116,10 +119,10 @@ def test_a_problem_alone_equals_the_problem_in_a_batch_with_padding(confidence: 
     scenes = random_scenes(16, seed=4)
     image, model, K, valid = stack(scenes, torch.float32)
     ransac = RansacPnp(confidence=confidence)
-    together = ransac(image, model, K, valid)
+    together = ransac(PnpProblem(image, model, K, valid))
     for b, scene in enumerate(scenes):
         n = len(scene.points_model)
-        alone = ransac(image[b : b + 1, :n], model[b : b + 1, :n], K[b : b + 1])
+        alone = ransac(PnpProblem(image[b : b + 1, :n], model[b : b + 1, :n], K[b : b + 1]))
         assert torch.equal(alone.inliers[0], together.inliers[b, :n])
         # Translations relative to the distance: across the line of sight they may be zero.
         poses = torch.stack([alone.T_camera_from_model[0], together.T_camera_from_model[b]])
@@ -132,16 +135,16 @@ def test_a_problem_alone_equals_the_problem_in_a_batch_with_padding(confidence: 
     wide_model = torch.full((16, 2 * image.shape[1] + 3, 3), torch.inf)
     wide_valid = torch.zeros(16, 2 * image.shape[1] + 3, dtype=torch.bool)
     wide_image[:, place], wide_model[:, place], wide_valid[:, place] = image, model, valid
-    scattered = ransac(wide_image, wide_model, K, wide_valid)
+    scattered = ransac(PnpProblem(wide_image, wide_model, K, wide_valid))
     assert torch.equal(scattered.inliers[:, place], together.inliers)
 
 
 def test_seed_decides_and_nothing_else() -> None:
     inputs = stack(random_scenes(8, seed=5), torch.float32)
-    first = RansacPnp(polish_rounds=0, seed=3)(*inputs)
+    first = RansacPnp(polish_rounds=0, seed=3)(PnpProblem(*inputs))
     torch.manual_seed(99)
-    second = RansacPnp(polish_rounds=0, seed=3)(*inputs)
-    other = RansacPnp(polish_rounds=0, seed=4)(*inputs)
+    second = RansacPnp(polish_rounds=0, seed=3)(PnpProblem(*inputs))
+    other = RansacPnp(polish_rounds=0, seed=4)(PnpProblem(*inputs))
     assert torch.equal(first.T_camera_from_model, second.T_camera_from_model)
     assert torch.equal(first.inliers, second.inliers)
     assert not torch.equal(first.T_camera_from_model, other.T_camera_from_model)
@@ -150,7 +153,10 @@ def test_seed_decides_and_nothing_else() -> None:
 @pytest.mark.parametrize("confidence", [None, 0.9999])
 def test_chunk_does_not_matter(confidence: float | None) -> None:
     inputs = stack(random_scenes(8, seed=6), torch.float64)
-    results = [RansacPnp(confidence=confidence, chunk=chunk)(*inputs) for chunk in (None, 1, 37, 100, 1000)]
+    results = [
+        RansacPnp(confidence=confidence, chunk=chunk)(PnpProblem(*inputs))
+        for chunk in (None, 1, 37, 100, 1000)
+    ]
     for result in results[1:]:
         assert torch.equal(result.inliers, results[0].inliers)
         torch.testing.assert_close(result.T_camera_from_model, results[0].T_camera_from_model)
@@ -162,7 +168,7 @@ def test_failures_are_flagged_among_good_problems(dtype: torch.dtype) -> None:
     scenes = [spoil(make_scene(rng, 40, "volume"), rng, 0.2, 1.0) for _ in range(8)]
     image, model, K, valid = stack(scenes, dtype)
     ransac = RansacPnp(min_inliers=15)
-    clean = ransac(image, model, K, valid)
+    clean = ransac(PnpProblem(image, model, K, valid))
     assert clean.success.all()
     valid[1, 3:] = False
     valid[2] = False
@@ -172,7 +178,7 @@ def test_failures_are_flagged_among_good_problems(dtype: torch.dtype) -> None:
     image[5] = torch.from_numpy(rng.uniform(80.0, 340.0, (40, 2))).to(dtype)
     K[6] = 0.0
     image[7] = torch.nan
-    result = ransac(image, model, K, valid)
+    result = ransac(PnpProblem(image, model, K, valid))
     assert result.status.tolist() == [
         PnpStatus.OK,
         PnpStatus.TOO_FEW_CORRESPONDENCES,
@@ -203,9 +209,9 @@ def test_absurd_numbers_neither_raise_nor_spread(dtype: torch.dtype, pixels: flo
     image[1] = (image[1] - 200.0) * pixels
     model[1] *= lengths
     for T in (
-        RansacPnp(iterations=20)(image, model, K).T_camera_from_model,
-        solve_epnp(image, model, K).T_camera_from_model,
-        solve_epnp(image[:, :4], model[:, :4], K).T_camera_from_model,
+        RansacPnp(iterations=20)(PnpProblem(image, model, K)).T_camera_from_model,
+        solve_epnp(PnpProblem(image, model, K)).T_camera_from_model,
+        solve_epnp(PnpProblem(image[:, :4], model[:, :4], K)).T_camera_from_model,
     ):
         assert torch.isfinite(T).all()
         assert pose_errors(T[:1], [scene])[0] < 0.1
@@ -221,7 +227,7 @@ def test_points_behind_the_camera_are_not_inliers() -> None:
         points_model=np.concatenate([scene.points_model, (behind - scene.t) @ scene.R]),
         points_image=np.concatenate([scene.points_image, image[:, :2] / image[:, 2:]]),
     )
-    result = RansacPnp()(*stack([scene], torch.float64))
+    result = RansacPnp()(PnpProblem(*stack([scene], torch.float64)))
     assert result.inliers[0].tolist() == [True] * 30 + [False] * 10
     assert pose_errors(result.T_camera_from_model, [scene])[0].max() < 1e-6
 
@@ -235,7 +241,7 @@ def test_many_matches_to_one_model_point() -> None:
         model = scene.points_model.copy()
         model[30:] = model[rng.integers(0, 5, 60)]
         scenes.append(scene._replace(points_model=model))
-    result = RansacPnp()(*stack(scenes, torch.float32))
+    result = RansacPnp()(PnpProblem(*stack(scenes, torch.float32)))
     angle, distance = pose_errors(result.T_camera_from_model, scenes)
     assert result.success.all()
     assert ((angle < 5.0) & (distance < 0.05)).mean() >= 0.9
@@ -244,10 +250,10 @@ def test_many_matches_to_one_model_point() -> None:
 def test_minimal_number_of_correspondences() -> None:
     rng = np.random.default_rng(10)
     scenes = [make_scene(rng, 4, "volume", wide=True) for _ in range(20)]
-    result = RansacPnp(min_inliers=4)(*stack(scenes, torch.float64))
+    result = RansacPnp(min_inliers=4)(PnpProblem(*stack(scenes, torch.float64)))
     assert result.success.all()
     assert (pose_errors(result.T_camera_from_model, scenes)[0] < 1e-3).mean() >= 0.95
-    assert not RansacPnp(min_inliers=5)(*stack(scenes, torch.float64)).success.any()
+    assert not RansacPnp(min_inliers=5)(PnpProblem(*stack(scenes, torch.float64))).success.any()
 
 
 def test_robust_polish_resists_outliers_within_the_threshold() -> None:
@@ -259,9 +265,11 @@ def test_robust_polish_resists_outliers_within_the_threshold() -> None:
         image[:30] += np.array([6.0, 2.0])
         scenes.append(scene._replace(points_image=image))
     inputs = stack(scenes, torch.float64)
-    plain = pose_errors(RansacPnp()(*inputs).T_camera_from_model, scenes)[0]
+    plain = pose_errors(RansacPnp()(PnpProblem(*inputs)).T_camera_from_model, scenes)[0]
     robust = pose_errors(
-        RansacPnp(polish=LevenbergMarquardtPnp(Huber(0.5), max_iterations=10))(*inputs).T_camera_from_model,
+        RansacPnp(polish=LevenbergMarquardtPnp(Huber(0.5), max_iterations=10))(
+            PnpProblem(*inputs)
+        ).T_camera_from_model,
         scenes,
     )[0]
     assert np.median(robust) < 0.6 * np.median(plain)
@@ -271,7 +279,7 @@ def test_gradients_reach_points_and_intrinsics() -> None:
     image, model, K, valid = stack(random_scenes(8, seed=12), torch.float64)
     valid[3, 2:] = False
     inputs = [x.requires_grad_() for x in (image, model, K)]
-    result = RansacPnp()(*inputs, valid)
+    result = RansacPnp()(PnpProblem(*inputs, valid))
     result.T_camera_from_model[:, :3].square().sum().backward()
     for x in inputs:
         assert torch.isfinite(x.grad).all()
@@ -287,7 +295,7 @@ def test_gradient_of_the_pose_with_respect_to_the_image() -> None:
     ransac = RansacPnp()
 
     def translation(shift: torch.Tensor) -> torch.Tensor:
-        return ransac(image + shift, model, K).T_camera_from_model[:, :3, 3]
+        return ransac(PnpProblem(image + shift, model, K)).T_camera_from_model[:, :3, 3]
 
     assert torch.autograd.gradcheck(
         translation,
@@ -316,9 +324,9 @@ def test_ranks_are_distinct_and_uniform() -> None:
 
 def test_autocast_does_not_lower_the_precision() -> None:
     inputs = stack(random_scenes(8, seed=14), torch.float32)
-    plain = RansacPnp()(*inputs)
+    plain = RansacPnp()(PnpProblem(*inputs))
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        mixed = RansacPnp()(*inputs)
+        mixed = RansacPnp()(PnpProblem(*inputs))
     assert torch.equal(plain.T_camera_from_model, mixed.T_camera_from_model)
 
 
@@ -326,10 +334,10 @@ def test_state_and_empty_input() -> None:
     ransac = RansacPnp(iterations=10)
     assert ransac.state_dict() == {}
     assert ransac.draws.shape == (10, 4)
-    none = ransac(torch.zeros(2, 0, 2), torch.zeros(2, 0, 3), torch.eye(3).expand(2, 3, 3))
+    none = ransac(PnpProblem(torch.zeros(2, 0, 2), torch.zeros(2, 0, 3), torch.eye(3).expand(2, 3, 3)))
     assert none.status.tolist() == [PnpStatus.TOO_FEW_CORRESPONDENCES] * 2
     assert torch.isfinite(none.T_camera_from_model).all()
-    empty = ransac(torch.zeros(0, 5, 2), torch.zeros(0, 5, 3), torch.zeros(0, 3, 3))
+    empty = ransac(PnpProblem(torch.zeros(0, 5, 2), torch.zeros(0, 5, 3), torch.zeros(0, 3, 3)))
     assert empty.T_camera_from_model.shape == (0, 4, 4)
 
 
@@ -351,9 +359,9 @@ def test_bad_settings(arguments: dict, message: str) -> None:
 
 def test_bad_shapes() -> None:
     with pytest.raises(ValueError, match=r"points_image must have shape \(B, N, 2\), got \(5, 2\)"):
-        RansacPnp()(torch.zeros(5, 2), torch.zeros(5, 3), torch.eye(3))
+        RansacPnp()(PnpProblem(torch.zeros(5, 2), torch.zeros(5, 3), torch.eye(3)))
     with pytest.raises(ValueError, match=r"valid must have shape \(1, 5\), got \(5,\)"):
-        RansacPnp()(torch.zeros(1, 5, 2), torch.zeros(1, 5, 3), torch.eye(3)[None], torch.ones(5))
+        RansacPnp()(PnpProblem(torch.zeros(1, 5, 2), torch.zeros(1, 5, 3), torch.eye(3)[None], torch.ones(5)))
 
 
 @pytest.mark.parametrize("solver", ["epnp", "p3p"])
@@ -364,7 +372,7 @@ def test_points_behind_the_camera_are_flagged(solver: str) -> None:
     model = torch.randn(40, 4, 3, generator=generator) * 50
     camera = model + torch.tensor([10.0, 20.0, -120.0])
     pixels = (camera / camera[..., 2:] @ K.T)[..., :2]
-    result = RansacPnp(solver, min_inliers=4)(pixels, model, K.expand(40, 3, 3))
+    result = RansacPnp(solver, min_inliers=4)(PnpProblem(pixels, model, K.expand(40, 3, 3)))
     behind = result.status == PnpStatus.BEHIND_CAMERA
     if solver == "epnp":  # three points can be put in front of the camera nearly always
         assert behind.sum() >= 3

@@ -5,7 +5,7 @@ from torch import Tensor
 
 from foundpose.geometry.transforms import make_transform
 from foundpose.optimization import BarronLoss
-from foundpose.pnp import LevenbergMarquardtPnp, RansacPnp, SoftInlierSelection
+from foundpose.pnp import LevenbergMarquardtPnp, PnpProblem, RansacPnp, SoftInlierSelection
 from foundpose.pnp.soft_selection import choose_softly
 from tests.pnp.scenes import make_scene, stack
 
@@ -45,7 +45,7 @@ def test_gradient_through_the_inliers_against_finite_differences(mode: str, loss
     *inputs, _ = problems()
     ransac = RansacPnp(polish=precise(mode, loss))
     leaves = [x.clone().requires_grad_() for x in inputs]
-    chosen = ransac(*leaves[:3], weights=leaves[3])
+    chosen = ransac(PnpProblem(*leaves[:3], weights=leaves[3]))
     assert chosen.success.all()
     generator = torch.Generator().manual_seed(0)
     probe = torch.randn(3, 3, 4, generator=generator, dtype=torch.float64)
@@ -59,7 +59,7 @@ def test_gradient_through_the_inliers_against_finite_differences(mode: str, loss
         for step in (1e-3, -1e-3):
             moved = list(inputs)
             moved[k] = inputs[k] + step * direction
-            result = ransac(*moved[:3], weights=moved[3])
+            result = ransac(PnpProblem(*moved[:3], weights=moved[3]))
             assert torch.equal(
                 result.inliers, chosen.inliers
             )  # the choice is the same, so there is a derivative
@@ -75,7 +75,7 @@ def test_only_inliers_have_gradients() -> None:
     valid = torch.ones(3, 40, dtype=torch.bool)
     valid[1, :5] = False
     leaves = [x.requires_grad_() for x in (image, model, K, weights)]
-    result = RansacPnp()(*leaves[:3], valid, leaves[3])
+    result = RansacPnp()(PnpProblem(*leaves[:3], valid, leaves[3]))
     result.T_camera_from_model[:, :3].square().sum().backward()
     for leaf in (image, model, weights):
         size = leaf.grad.abs().reshape(3, 40, -1).sum(-1)
@@ -88,8 +88,8 @@ def test_the_same_with_and_without_gradient() -> None:
     for soft in (None, SoftInlierSelection(4)):
         ransac = RansacPnp(soft_selection=soft)
         with torch.no_grad():
-            plain = ransac(image, model, K, weights=weights)
-        graph = ransac(image.clone().requires_grad_(), model, K, weights=weights)
+            plain = ransac(PnpProblem(image, model, K, weights=weights))
+        graph = ransac(PnpProblem(image.clone().requires_grad_(), model, K, weights=weights))
         assert torch.equal(plain.T_camera_from_model, graph.T_camera_from_model)
         assert torch.equal(plain.inliers, graph.inliers)
 
@@ -102,7 +102,7 @@ def test_gradients_do_not_depend_on_the_batch(soft) -> None:
 
     def gradients(rows: slice) -> list[Tensor]:
         leaves = [x[rows].clone().requires_grad_() for x in (image, model, K, weights)]
-        result = ransac(*leaves[:3], weights=leaves[3])
+        result = ransac(PnpProblem(*leaves[:3], weights=leaves[3]))
         value = scaled(result.T_camera_from_model).square().sum()
         if result.candidates is not None:
             T = result.candidates.T_camera_from_model
@@ -149,7 +149,7 @@ def test_gradients_are_finite_at_hard_cases(case: str, mode: str, solver: str, d
         polish=LevenbergMarquardtPnp(differentiation=mode),
         soft_selection=SoftInlierSelection(8),
     )
-    result = ransac(*inputs, valid)
+    result = ransac(PnpProblem(*inputs, valid))
     losses = result.candidates.T_camera_from_model[..., :3, :].square().sum((-1, -2))
     value = result.T_camera_from_model[:, :3].square().sum() + result.candidates.expected(losses).sum()
     gradients = torch.autograd.grad(value, inputs, allow_unused=True)
@@ -163,10 +163,10 @@ def test_gradients_are_finite_at_hard_cases(case: str, mode: str, solver: str, d
 def test_without_polish_there_is_the_gradient_of_a_newton_step() -> None:
     image, model, K, _, _ = problems(2, noise=0.0)
     leaf = image.requires_grad_()
-    result = RansacPnp(polish_rounds=0)(leaf, model, K)
+    result = RansacPnp(polish_rounds=0)(PnpProblem(leaf, model, K))
     (gradient,) = torch.autograd.grad(scaled(result.T_camera_from_model).square().sum(), leaf)
     # The data fit exactly, so the sample's pose is the optimum on all inliers.
-    polished = RansacPnp(polish=precise())(leaf, model, K)
+    polished = RansacPnp(polish=precise())(PnpProblem(leaf, model, K))
     assert torch.equal(polished.inliers, result.inliers)
     (expected,) = torch.autograd.grad(scaled(polished.T_camera_from_model).square().sum(), leaf)
     torch.testing.assert_close(gradient, expected, rtol=1e-3, atol=1e-7)
@@ -178,29 +178,31 @@ def test_weights() -> None:
     shifted[:, ::2] += 4.0
     trust = torch.ones(3, 40, dtype=torch.float64)
     trust[:, ::2] = 1e-6
-    right = RansacPnp()(image, model, K).T_camera_from_model
-    plain = (RansacPnp()(shifted, model, K).T_camera_from_model - right)[:, :3].flatten(1).norm(dim=1)
-    weighted = RansacPnp()(shifted, model, K, weights=trust).T_camera_from_model
+    right = RansacPnp()(PnpProblem(image, model, K)).T_camera_from_model
+    plain = (
+        (RansacPnp()(PnpProblem(shifted, model, K)).T_camera_from_model - right)[:, :3].flatten(1).norm(dim=1)
+    )
+    weighted = RansacPnp()(PnpProblem(shifted, model, K, weights=trust)).T_camera_from_model
     assert ((weighted - right)[:, :3].flatten(1).norm(dim=1) < 0.5 * plain).all()
     # A weight of zero, or one that is no number, is as good as absence.
     trust[:, ::4], trust[:, 2::4] = 0.0, torch.nan
     valid = torch.ones(3, 40, dtype=torch.bool)
     valid[:, ::2] = False
-    without = RansacPnp()(shifted, model, K, valid)
-    got = RansacPnp()(shifted, model, K, weights=trust)
+    without = RansacPnp()(PnpProblem(shifted, model, K, valid))
+    got = RansacPnp()(PnpProblem(shifted, model, K, weights=trust))
     assert torch.equal(got.inliers, without.inliers)
     torch.testing.assert_close(got.T_camera_from_model, without.T_camera_from_model, rtol=1e-6, atol=1e-6)
-    ones = RansacPnp()(image, model, K, weights=torch.ones(3, 40, dtype=torch.float64))
+    ones = RansacPnp()(PnpProblem(image, model, K, weights=torch.ones(3, 40, dtype=torch.float64)))
     assert torch.equal(ones.T_camera_from_model, right)
     with pytest.raises(ValueError, match=r"weights must have shape \(3, 40\), got \(3, 39\)"):
-        RansacPnp()(image, model, K, weights=trust[:, :39])
+        RansacPnp()(PnpProblem(image, model, K, weights=trust[:, :39]))
 
 
 def test_candidates_are_a_distribution_around_the_hard_choice() -> None:
     image, model, K, _, _ = problems(4, outliers=0.5)
     image[3] = torch.nan
-    soft = RansacPnp(soft_selection=SoftInlierSelection(8))(image, model, K)
-    hard = RansacPnp()(image, model, K)
+    soft = RansacPnp(soft_selection=SoftInlierSelection(8))(PnpProblem(image, model, K))
+    hard = RansacPnp()(PnpProblem(image, model, K))
     assert hard.candidates is None
     torch.testing.assert_close(soft.T_camera_from_model, hard.T_camera_from_model, rtol=1e-9, atol=1e-9)
     candidates = soft.candidates
@@ -213,10 +215,12 @@ def test_candidates_are_a_distribution_around_the_hard_choice() -> None:
     assert torch.equal(candidates.T_camera_from_model[:3, 0], soft.T_camera_from_model[:3])
     # The soft count is close to the hard one, and a sharp one equals it.
     assert ((candidates.score[:3, 0] - soft.num_inliers[:3]).abs() < 6).all()
-    sharp = RansacPnp(soft_selection=SoftInlierSelection(8, sharpness=1e6))(image, model, K)
+    sharp = RansacPnp(soft_selection=SoftInlierSelection(8, sharpness=1e6))(PnpProblem(image, model, K))
     torch.testing.assert_close(sharp.candidates.score[:3, 0], soft.num_inliers[:3].double())
     # A low temperature puts all trust in the best.
-    cold = RansacPnp(soft_selection=SoftInlierSelection(8, temperature=1e-3))(image, model, K).candidates
+    cold = RansacPnp(soft_selection=SoftInlierSelection(8, temperature=1e-3))(
+        PnpProblem(image, model, K)
+    ).candidates
     best = cold.score.masked_fill(~cold.valid, -1).argmax(1)
     # Candidates may coincide after the polish and then share the probability.
     same = (cold.score - cold.score.gather(1, best[:, None])).abs() < 1e-6
@@ -229,23 +233,23 @@ def test_expected_loss_is_differentiable_in_the_choice() -> None:
     ransac = RansacPnp(
         min_inliers=4, polish=precise(), polish_rounds=1, soft_selection=SoftInlierSelection(6, 0.2, 2.0)
     )
-    truth = ransac(image, model, K).T_camera_from_model.detach()
+    truth = ransac(PnpProblem(image, model, K)).T_camera_from_model.detach()
     generator = torch.Generator().manual_seed(0)
 
     def expected(image: Tensor) -> Tensor:
-        candidates = ransac(image, model, K).candidates
+        candidates = ransac(PnpProblem(image, model, K)).candidates
         T = candidates.T_camera_from_model
         losses = (scaled(T) - scaled(truth)[:, None]).square().sum((-1, -2))
         return candidates.expected(losses)
 
     leaf = image.clone().requires_grad_()
-    candidates = ransac(image, model, K).candidates
+    candidates = ransac(PnpProblem(image, model, K)).candidates
     assert (candidates.probability > 0.01).sum() > 4
     value = expected(leaf)
     assert (value > 1e-6).all()
     (gradient,) = torch.autograd.grad(value.sum(), leaf)
     # Outliers of the best pose, too, unless they are far from every candidate.
-    outliers = ~ransac(image, model, K).inliers
+    outliers = ~ransac(PnpProblem(image, model, K)).inliers
     assert (gradient.abs().sum(-1)[outliers] > 1e-6).any()
     for _ in range(3):
         direction = torch.randn(image.shape, generator=generator, dtype=torch.float64)

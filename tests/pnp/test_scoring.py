@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from foundpose.pnp import RansacPnp
-from foundpose.pnp.sampling import sample_hypotheses
+from foundpose.pnp import PnpProblem, RansacPnp
+from foundpose.pnp.sampling import Sampling, sample_hypotheses
 from foundpose.pnp.scoring import score_poses
 from tests.pnp.scenes import pose_errors, stack
 from tests.pnp.test_ransac import random_scenes
@@ -28,7 +28,7 @@ def test_quality_equals_a_loop_in_numpy(dtype: torch.dtype, monkeypatch: pytest.
     scenes = random_scenes(6, seed=12)
     image, model, K, valid = stack(scenes, dtype)
     poses = torch.from_numpy(perturbed(scenes, 40, 2.0)).to(dtype)
-    quality = score_poses(poses, image, model, K, valid, 10.0)
+    quality = score_poses(poses, PnpProblem(image, model, K, valid), 10.0)
     for b in range(len(scenes)):
         n = valid[b]
         points = model[b][n].double().numpy()
@@ -46,7 +46,7 @@ def test_quality_equals_a_loop_in_numpy(dtype: torch.dtype, monkeypatch: pytest.
     assert quality.max() > 20
     # Blocks are for speed only.
     monkeypatch.setattr("foundpose.pnp.scoring._CPU_NUMBERS_PER_BLOCK", 7 * valid.numel())
-    assert torch.equal(score_poses(poses, image, model, K, valid, 10.0), quality)
+    assert torch.equal(score_poses(poses, PnpProblem(image, model, K, valid), 10.0), quality)
 
 
 def test_numbers_that_overflow_are_no_inliers() -> None:
@@ -55,7 +55,7 @@ def test_numbers_that_overflow_are_no_inliers() -> None:
     T = torch.eye(4).repeat(1, 3, 1, 1)
     T[0, :, 2, 3] = torch.tensor([0.0, 1e30, 1.0])
     K = torch.eye(3)[None] * torch.tensor([1e12, 1e12, 1.0])
-    quality = score_poses(T, image, model, K, torch.ones(1, 5, dtype=torch.bool), 10.0)
+    quality = score_poses(T, PnpProblem(image, model, K), 10.0)
     assert torch.isfinite(quality).all()
     assert quality[0].floor().tolist() == [0.0, 4.0, 4.0]
 
@@ -65,7 +65,7 @@ def test_few_points_score_as_well() -> None:
     inputs = stack(scenes, torch.float32)
     shares = []
     for score_points in (None, 40):
-        result = RansacPnp(score_points=score_points)(*inputs)
+        result = RansacPnp(score_points=score_points)(PnpProblem(*inputs))
         rotation, translation = pose_errors(result.T_camera_from_model, scenes)
         shares.append(((rotation < 5.0) & (translation < 0.05)).mean())
         # What is returned is about all correspondences.
@@ -73,7 +73,7 @@ def test_few_points_score_as_well() -> None:
         assert result.num_inliers.max() > 40
     assert shares[1] > shares[0] - 0.05
     # A bound that does not bind changes nothing.
-    loose, none = (RansacPnp(score_points=bound)(*inputs) for bound in (10_000, None))
+    loose, none = (RansacPnp(score_points=bound)(PnpProblem(*inputs)) for bound in (10_000, None))
     assert torch.equal(loose.T_camera_from_model, none.T_camera_from_model)
 
 
@@ -82,19 +82,17 @@ def test_sampling_stops_as_the_usual_bound_says() -> None:
     scenes = random_scenes(12, seed=21)
     image, model, K, valid = stack(scenes, torch.float64)
     draws = torch.randint(2**31, (300, 4), generator=torch.Generator().manual_seed(0))
-    settings = {"solver": "p3p", "threshold": 10.0}
+    each = Sampling("p3p", threshold=10.0)
     usable = torch.ones(len(scenes), dtype=torch.bool)
-    stopped = sample_hypotheses(image, model, K, valid, usable, draws, confidence=0.99, **settings)
+    problem = PnpProblem(image, model, K, valid)
+    stopped = sample_hypotheses(problem, usable, draws, each._replace(confidence=0.99))
     after = []
     for b, scene in enumerate(scenes):
-        one = (x[b : b + 1] for x in (image, model, K, valid))
-        problem = [*one, usable[:1]]
+        one = problem.take(torch.tensor([b]))
         count, best, number = len(scene.points_model), -1.0, 0
         while number < 300:
             number += 1
-            last = sample_hypotheses(
-                *problem, draws[number - 1 : number], confidence=None, **settings
-            ).quality.item()
+            last = sample_hypotheses(one, usable[:1], draws[number - 1 : number], each).quality.item()
             best = max(best, last)
             ratio = min(math.floor(max(best, 0.0)) / count, 1 - 1e-6)
             if number >= 50 and number * math.log1p(-(ratio**4)) <= math.log(0.01):

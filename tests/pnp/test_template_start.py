@@ -12,7 +12,7 @@ from foundpose.geometry import (
     transform_points,
 )
 from foundpose.geometry.transforms import se3_exp
-from foundpose.pnp import RansacPnp, TemplateStart
+from foundpose.pnp import PnpProblem, RansacPnp, TemplateStart
 
 K_TEMPLATE = intrinsics_matrix(1000.0, 1000.0, 209.5, 209.5).double()
 K_CROP = intrinsics_matrix(1400.0, 1400.0, 209.5, 209.5).double()
@@ -78,18 +78,18 @@ def test_the_same_camera_gives_the_same_pose():
 def test_polish_brings_the_start_to_the_truth():
     points, T_template, T_crop, u_template, u_crop, matched = scene(wrong=0.4)
     T = start_of(T_template, u_template, u_crop, points.mean(0))
-    problem = (u_crop[None], matched[None], K_CROP[None], torch.ones(1, 120).bool())
-    result = RansacPnp().polish_starts(T[None], *problem)
+    problem = PnpProblem(u_crop[None], matched[None], K_CROP[None])
+    result = RansacPnp().polish_starts(T[None], problem)
     assert result.success.all()
     # A wrong match may lie within the threshold by chance; samples lead to the same pose.
     assert float(rotation_angle(result.T_camera_from_model[0, :3, :3], T_crop[:3, :3])) < 0.01
-    sampled = RansacPnp()(*problem).T_camera_from_model
+    sampled = RansacPnp()(problem).T_camera_from_model
     torch.testing.assert_close(result.T_camera_from_model, sampled, atol=1e-3, rtol=1e-3)
     # A start that is no pose, and one that is far off, are flagged or finite; never an exception.
-    nan = RansacPnp().polish_starts(torch.full((1, 4, 4), torch.nan).double(), *problem)
+    nan = RansacPnp().polish_starts(torch.full((1, 4, 4), torch.nan).double(), problem)
     assert not nan.success.any()
     assert nan.T_camera_from_model.isfinite().all()
-    far = RansacPnp().polish_starts(invert_transform(T_crop)[None], *problem)
+    far = RansacPnp().polish_starts(invert_transform(T_crop)[None], problem)
     assert far.T_camera_from_model.isfinite().all()
 
 
@@ -126,10 +126,10 @@ def test_guided_samples_find_what_uniform_ones_miss():
     matched = torch.where(good[..., None], points, points[shuffles])
     # Priorities tell right matches from wrong ones, but badly.
     priority = good.double() + 1.5 * torch.randn(problems, 120, generator=g, dtype=torch.float64)
-    args = (u_crop.expand(problems, -1, -1), matched, K_CROP.expand(problems, 3, 3))
+    problem = PnpProblem(u_crop.expand(problems, -1, -1), matched, K_CROP.expand(problems, 3, 3))
 
     def share(pnp, priority):
-        T = pnp(*args, priority=priority).T_camera_from_model
+        T = pnp(problem, priority=priority).T_camera_from_model
         return float(
             (rotation_angle(T[:, :3, :3], T_crop[:3, :3].expand(problems, 3, 3)) < 0.02).float().mean()
         )
@@ -140,9 +140,9 @@ def test_guided_samples_find_what_uniform_ones_miss():
     assert abs(share(RansacPnp(iterations=100, guidance=1.0), priority) - uniform) < 0.25
     # Only the order of priorities counts.
     guided = RansacPnp(iterations=100, guidance=2.0)
-    first = guided(*args, priority=priority).T_camera_from_model
-    assert torch.equal(first, guided(*args, priority=priority.exp()).T_camera_from_model)
+    first = guided(problem, priority=priority).T_camera_from_model
+    assert torch.equal(first, guided(problem, priority=priority.exp()).T_camera_from_model)
     with pytest.raises(ValueError, match="guidance must be at least 1"):
         RansacPnp(guidance=0.5)
     with pytest.raises(ValueError, match="priority must have shape"):
-        RansacPnp()(*args, priority=priority[:, :5])
+        RansacPnp()(problem, priority=priority[:, :5])

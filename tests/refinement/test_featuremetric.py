@@ -7,7 +7,7 @@ from torch import Tensor
 
 from foundpose.geometry.transforms import rotation_angle, se3_exp
 from foundpose.optimization import BarronLoss, Huber, LeastSquares
-from foundpose.pnp.polish import LocalFrame
+from foundpose.optimization.local_frame import LocalFrame
 from foundpose.refinement import AlignmentProblem, FeaturemetricAlignment
 from foundpose.refinement.cost import FeaturemetricCost
 from tests.refinement.problems import OFFSET, SIZE, STRIDE, cast, make_problem, perturb, with_maps

@@ -9,7 +9,9 @@ from torch import Tensor, nn
 from foundpose.features import ResidualAdapter
 from foundpose.losses import GeodesicRotationLoss, PointMatchingLoss, ProjectionLoss
 from foundpose.matching import SoftPatchMatcher
-from foundpose.pnp import LevenbergMarquardtPnp, RansacPnp
+from foundpose.pnp import LevenbergMarquardtPnp, PnpProblem, RansacPnp
+from foundpose.representation import TemplatePatches
+from foundpose.retrieval import QueryPatches
 from foundpose.training.adapter.pairs import PairBatch
 from foundpose.training.base import adam
 
@@ -99,19 +101,20 @@ class AdapterTraining(pl.LightningModule):
         Differentiable w.r.t. the parameters of adapter and matcher, and the batch's descriptors and points, through
         the optimum of PnP.
         """
-        matches = self.matcher(
-            self.adapter(batch.query_descriptors),
-            batch.query_valid,
+        query = QueryPatches(self.adapter(batch.query_descriptors), batch.query_pixels, batch.query_valid)
+        template = TemplatePatches(
             self.adapter(batch.template_descriptors).unsqueeze(1),
-            batch.template_valid.unsqueeze(1),
-            batch.query_pixels,
             batch.template_points.unsqueeze(1),
+            batch.template_points.new_zeros(*batch.template_valid.shape, 2).unsqueeze(1),  # not looked at
+            batch.template_valid.unsqueeze(1),
         )
+        matches = self.matcher(query, template)
         points, weight, valid = (x.squeeze(1) for x in (matches.points_model, matches.weight, matches.valid))
+        problem = PnpProblem(batch.query_pixels, points, batch.K_crop, valid, weight)
         if isinstance(self.pnp, RansacPnp):
-            found = self.pnp(batch.query_pixels, points, batch.K_crop, valid, weight)
+            found = self.pnp(problem)
             return PairPoses(found.T_camera_from_model, found.success & found.regular)
-        optimum = self.pnp(batch.T_crop_from_model, batch.query_pixels, points, batch.K_crop, weight)
+        optimum = self.pnp(batch.T_crop_from_model, problem)
         # The implicit gradient is that of an optimum, so there has to be one.
         valid = optimum.converged & optimum.regular & ~optimum.failed
         return PairPoses(optimum.T_camera_from_model, valid)

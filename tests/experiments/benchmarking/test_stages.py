@@ -1,6 +1,7 @@
 """Tasks, references and curves on a small workload."""
 
 import time
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -216,8 +217,9 @@ def test_retrieval_and_matching_template_by_template(stages, workload):
         root=retriever.bow.normalization == "hellinger",
     )
     assert np.array_equal(found, retriever(*inputs["retriever"]).index)
-    matches = match_by_template(*arrays(*inputs["matcher"][:4]))
-    valid = np.broadcast_to(inputs["matcher"][1][:, None], matches.shape)
+    query, patches = inputs["matcher"][:2]
+    matches = match_by_template(*arrays(query.descriptors, query.valid, patches.descriptors, patches.valid))
+    valid = np.broadcast_to(query.valid[:, None], matches.shape)
     assert np.array_equal(matches[valid], stages.matcher(*inputs["matcher"]).template_patch.numpy()[valid])
 
 
@@ -226,12 +228,13 @@ def test_polish_by_scipy(stages, workload):
     """From a pose a little off, both come to the same pose on the inliers of the first problem."""
     arguments = stage_inputs(stages, workload)[0]["pnp"]
     found = stages.pnp(*arguments)
-    points_image, points_model, K = (x[:1] for x in arguments[:3])
-    start = turned(found.T_camera_from_model[:1], points_model[0], degrees=1.0)
-    weights = found.inliers[:1].to(K.dtype)
-    ours = LevenbergMarquardtPnp(max_iterations=30)(start, points_image, points_model, K, weights)
+    problem = arguments[0].take(slice(1))
+    problem = replace(problem, weights=found.inliers[:1])
+    start = turned(found.T_camera_from_model[:1], problem.points_model[0], degrees=1.0)
+    ours = LevenbergMarquardtPnp(max_iterations=30)(start, problem)
     chosen = found.inliers[0]
-    T, x, u, k = arrays(start[0].double(), *(t[0].double() for t in (points_model, points_image, K)))
+    numbers = (start, problem.points_model, problem.points_image, problem.K)
+    T, x, u, k = arrays(*(t[0].double() for t in numbers))
     theirs = pnp_least_squares(T, x[chosen], u[chosen], k)
     apart = pose_deviation(ours.T_camera_from_model[0].double(), theirs, unit=theirs[:3, 3].norm())
     assert apart.rotation < 0.02
