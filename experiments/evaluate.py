@@ -11,7 +11,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from foundpose.config import clear_errors
-from foundpose.evaluation import run_evaluation
+from foundpose.evaluation.run import run_evaluation
 
 
 @hydra.main(version_base="1.3", config_path="../conf", config_name="evaluate")

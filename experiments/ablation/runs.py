@@ -113,7 +113,7 @@ def run_once(cfg: DictConfig, name: str | None = None, overrides: Sequence[str] 
     started.write(folder)
     try:
         # Imported here because Lightning takes its time, and reports do without.
-        from foundpose.evaluation import run_evaluation
+        from foundpose.evaluation.run import run_evaluation
 
         run_evaluation(cfg, folder)
         record = replace(started, status="finished", error=None, figures=_figures(folder))

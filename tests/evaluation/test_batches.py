@@ -9,10 +9,9 @@ from PIL import Image
 
 from foundpose.bop import BopDataset, Instance, detected_instances, ground_truth_instances
 from foundpose.bop.pictures import Photographs
-from foundpose.evaluation import BatchRecord, InstanceBatches, ShardWriter, plan_batches, read_shards
-from foundpose.evaluation.data import BatchesOfRank
+from foundpose.evaluation.data import BatchesOfRank, InstanceBatches, plan_batches
 from foundpose.evaluation.records import instance_record
-from foundpose.evaluation.shards import shard_path
+from foundpose.evaluation.shards import BatchRecord, ShardWriter, read_shards, shard_path
 
 
 def instances(count, seed=0):

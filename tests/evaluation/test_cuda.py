@@ -6,9 +6,11 @@ import torch
 
 from foundpose.bop import BopDataset, ground_truth_instances, score_results
 from foundpose.bop.pictures import TrueCoordinates
-from foundpose.evaluation import PoseDataModule, PoseEvaluation, all_records, estimate_dataset, merge_shards
+from foundpose.evaluation.data import PoseDataModule
+from foundpose.evaluation.module import PoseEvaluation, estimate_dataset
 from foundpose.evaluation.objects import DatasetObjects
 from foundpose.evaluation.records import to_results
+from foundpose.evaluation.report import all_records, merge_shards
 from foundpose.features import CoordinateCode
 from foundpose.geometry import SuperFibonacci, rotation_angle
 from foundpose.onboarding import Onboarder, RepresentationStore

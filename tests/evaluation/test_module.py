@@ -10,16 +10,11 @@ import foundpose.utils.batch_size
 import foundpose.utils.timing
 from foundpose.bop import BopDataset, detected_instances, ground_truth_instances
 from foundpose.bop.pictures import TrueCoordinates
-from foundpose.evaluation import (
-    PoseDataModule,
-    PoseEvaluation,
-    all_records,
-    estimate_dataset,
-    merge_shards,
-    timing,
-)
+from foundpose.evaluation.data import PoseDataModule
+from foundpose.evaluation.module import PoseEvaluation, estimate_dataset
 from foundpose.evaluation.objects import DatasetObjects
 from foundpose.evaluation.records import to_results
+from foundpose.evaluation.report import all_records, merge_shards, timing
 from foundpose.evaluation.shards import shard_path
 from foundpose.geometry import rotation_angle
 from foundpose.onboarding import RepresentationStore

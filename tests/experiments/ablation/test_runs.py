@@ -64,7 +64,7 @@ def test_what_only_evaluate_does_is_refused(tmp_path):
 
 
 def test_a_row_with_other_settings_is_not_that_row(tmp_path, monkeypatch):
-    monkeypatch.setattr("foundpose.evaluation.run_evaluation", lambda cfg, folder: None)
+    monkeypatch.setattr("foundpose.evaluation.run.run_evaluation", lambda cfg, folder: None)
     monkeypatch.setattr("ablation.runs._figures", lambda folder: {"AR": 0.5})
 
     def row(*overrides):
@@ -79,7 +79,7 @@ def test_a_row_with_other_settings_is_not_that_row(tmp_path, monkeypatch):
 
 def test_a_finished_run_is_done_again_only_for_other_errors(tmp_path, monkeypatch):
     calls = []
-    monkeypatch.setattr("foundpose.evaluation.run_evaluation", lambda cfg, folder: calls.append(folder))
+    monkeypatch.setattr("foundpose.evaluation.run.run_evaluation", lambda cfg, folder: calls.append(folder))
     monkeypatch.setattr("ablation.runs._figures", lambda folder: {"AR": 0.5})
     cfg = load("ablate", f"folder={tmp_path}", "errors=[mssd]")
     run_once(cfg)
@@ -94,7 +94,7 @@ def test_a_killed_run_is_listed(tmp_path, monkeypatch):
     def killed(cfg, folder):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("foundpose.evaluation.run_evaluation", killed)
+    monkeypatch.setattr("foundpose.evaluation.run.run_evaluation", killed)
     with pytest.raises(KeyboardInterrupt):
         run_once(load("ablate", f"folder={tmp_path}"))
     (record,) = collect_runs(tmp_path / "runs")
