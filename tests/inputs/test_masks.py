@@ -84,8 +84,14 @@ def stray():
     return mask
 
 
-def two_pieces(distance):
-    return disc(center=(6, 6), radius=5) | disc(center=(6, 6 + distance), radius=4)
+def two_pieces(down, right):
+    return disc(center=(6, 6), radius=5) | disc(center=(6 + down, 6 + right), radius=4)
+
+
+def crumb():
+    mask = disc(radius=5)
+    mask[15, 36] = True
+    return mask
 
 
 def test_reading_warns_and_keeps_the_largest_piece(tmp_path):
@@ -113,8 +119,10 @@ PLAUSIBLE = [
     ("inverse", ~disc(radius=12), r"covers 6\d\.\d% .* is it inverted", False),
     ("large", disc(center=(15, 20), radius=16), None, False),
     ("stray pixels", stray(), r"far apart: the largest has 69 of 71 pixels, .* 14\.\d times", True),
-    ("far pieces", two_pieces(25), r"far apart: .*largest_component=false", True),
-    ("near pieces", two_pieces(10), None, False),
+    ("far pieces", two_pieces(18, 28), r"far apart: .*largest_component=false", True),
+    ("near pieces", two_pieces(0, 12), None, False),
+    ("hidden in part", two_pieces(0, 25), None, False),
+    ("crumb", crumb(), r"far apart: the largest has 69 of 70 pixels, .* 2\.3 times", True),
     ("corners", np.eye(30, 40, dtype=bool), None, False),
     ("empty", np.zeros(SIZE, bool), None, False),
 ]
