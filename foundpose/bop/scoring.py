@@ -15,7 +15,7 @@ from foundpose.bop.results import PoseResult
 from foundpose.bop.scores import AVERAGED, FunctionScores, Recall, Scores
 from foundpose.bop.targets import Target, describe_target
 from foundpose.bop.vsd_image import DepthImage, DepthObject, PosedObject, vsd_of_pairs
-from foundpose.rendering.mesh_io import read_mesh_file
+from foundpose.rendering.mesh_files import read_mesh_file
 from foundpose.utils.units import check_unit
 
 FRACTIONS = tuple(0.05 + 0.05 * k for k in range(10))  # to the last bit those of the toolkit

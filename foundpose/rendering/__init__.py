@@ -3,7 +3,8 @@
 from foundpose.rendering.base import Renderer, RenderOutput
 from foundpose.rendering.coordinates import CoordinateRenderer, render_coordinate_image
 from foundpose.rendering.gl import PyrenderRenderer, RendererNotAvailableError
-from foundpose.rendering.mesh import Mesh, MeshError, load_mesh, warn_if_scale_implausible
+from foundpose.rendering.mesh import Mesh, MeshError
+from foundpose.rendering.mesh_files import load_mesh
 from foundpose.rendering.raycast import RaycastRenderer
 
 __all__ = [
@@ -17,5 +18,4 @@ __all__ = [
     "RendererNotAvailableError",
     "load_mesh",
     "render_coordinate_image",
-    "warn_if_scale_implausible",
 ]

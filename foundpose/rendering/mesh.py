@@ -1,11 +1,8 @@
-"""Triangle meshes with colours or a texture: loading, checks, size."""
+"""Triangle meshes with colours or a texture: checks, size."""
 
 import hashlib
-import warnings
 from collections.abc import Callable
 from functools import cached_property
-from os import PathLike
-from pathlib import Path
 from typing import TypeVar
 from weakref import WeakKeyDictionary
 
@@ -15,14 +12,17 @@ import trimesh.convex
 from numpy.typing import NDArray
 from torch import Tensor
 
-from foundpose.rendering.mesh_io import MeshArrays, MeshError, read_mesh_file
-
-__all__ = ["Mesh", "MeshError", "load_mesh", "warn_if_scale_implausible"]
-
 T = TypeVar("T")
 
-_PLAUSIBLE_DIAMETERS = (1e-3, 1e5)
-_PLAUSIBLE_DISTANCES = (0.05, 500.0)  # camera distance in object diameters
+PLAIN_ALBEDO = 0.75
+"""Grey level of surfaces for which there are neither colours nor a texture."""
+
+# Single precision keeps a millionth of an object's size up to here.
+_MOST_DISTANT = 100.0
+
+
+class MeshError(ValueError):
+    """A mesh that cannot be used, with the reason."""
 
 
 class Mesh:
@@ -40,7 +40,8 @@ class Mesh:
         vertex_normals: (V, 3) for smooth shading, any length. Computed from the faces when absent.
 
     Raises:
-        MeshError: empty mesh, wrong shapes, indices out of range, NaN or infinite vertices, no extent.
+        MeshError: empty mesh, wrong shapes, indices out of range, NaN or infinite vertices, no extent, far
+            from its origin.
 
     Attributes are CPU tensors: float32, ``faces`` int64; ``vertex_normals`` have unit length.
     """
@@ -54,7 +55,7 @@ class Mesh:
         texture: Tensor | None = None,
         vertex_normals: Tensor | None = None,
     ) -> None:
-        _check_geometry(vertices, faces)
+        check_geometry(vertices, faces)
         _check_appearance(len(vertices), vertex_colors, uv, texture, vertex_normals)
         self.vertices = _to_cpu(vertices)
         self.faces = faces.detach().to("cpu", torch.int64).contiguous()
@@ -124,77 +125,6 @@ def once_per_mesh(build: Callable[[Mesh], T]) -> Callable[[Mesh], T]:
     return of
 
 
-def load_mesh(path: str | PathLike[str]) -> Mesh:
-    """Load a mesh with its colours or texture.
-
-    PLY (vertex colours; texture named in a ``TextureFile`` comment, as in BOP), OBJ with its MTL file, GLB
-    (nodes flattened; base colour texture and factor) and STL; other formats as far as trimesh reads them.
-    Vertices without a face are dropped, and so are, with a warning, degenerate and duplicate faces. Normals
-    are computed from the faces; those in the file are not used.
-
-    Args:
-        path: the file. Textures are looked for beside it.
-
-    Returns:
-        The mesh, lengths in the file's unit.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        MeshError: the file cannot be parsed, has no faces, NaN or infinite vertices or no extent.
-    """
-    path = Path(path)
-    arrays = read_mesh_file(path)
-    try:
-        _check_geometry(torch.from_numpy(arrays.vertices), torch.from_numpy(arrays.faces))
-        arrays = _clean(arrays, path)
-        mesh = Mesh(
-            vertices=torch.from_numpy(arrays.vertices),
-            faces=torch.from_numpy(arrays.faces),
-            vertex_colors=None if arrays.colors is None else torch.from_numpy(arrays.colors),
-            uv=None if arrays.uv is None else torch.from_numpy(arrays.uv),
-            texture=None
-            if arrays.texture is None
-            else torch.from_numpy(arrays.texture.copy()).permute(2, 0, 1).float() / 255.0,
-        )
-    except MeshError as error:
-        raise MeshError(f"{path}: {error}") from error
-    warn_if_scale_implausible(mesh)
-    return mesh
-
-
-def warn_if_scale_implausible(mesh: Mesh, distance: float | None = None) -> None:
-    """Warn about a mesh whose size makes no sense, and name the unit that it is likely in.
-
-    Nothing is rescaled: lengths stay in mesh units, and poses come out in the same units.
-
-    Args:
-        mesh: the mesh.
-        distance: typical distance of the camera to the object, where known, in what is believed to be the
-            mesh's unit. Without it only the diameter is judged, so metres and millimetres both pass.
-    """
-    diameter = mesh.diameter
-    smallest, largest = _PLAUSIBLE_DIAMETERS
-    if diameter < smallest:
-        _warn(f"a mesh diameter of {diameter:.3g} is very small: is the mesh in kilometres, or scaled twice?")
-    elif diameter > largest:
-        _warn(
-            f"a mesh diameter of {diameter:.3g} is very large: is the mesh in micrometres, or scaled twice?"
-        )
-    if distance is None:
-        return
-    ratio = distance / diameter
-    if ratio > _PLAUSIBLE_DISTANCES[1]:
-        _warn(
-            f"the camera is {ratio:.3g} diameters away from the mesh: the mesh (diameter {diameter:.3g}) is "
-            f"likely in metres and the camera distance ({distance:.3g}) in millimetres"
-        )
-    elif ratio < _PLAUSIBLE_DISTANCES[0]:
-        _warn(
-            f"the camera is only {ratio:.3g} diameters away from the mesh: the mesh (diameter {diameter:.3g}) "
-            f"is likely in millimetres and the camera distance ({distance:.3g}) in metres"
-        )
-
-
 def area_weighted_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     """Vertex normals (V, 3), unit length: mean of the adjacent faces' normals weighted with their areas.
 
@@ -212,11 +142,8 @@ def _to_cpu(values: Tensor) -> Tensor:
     return values.detach().to("cpu", torch.float32).contiguous()
 
 
-def _warn(message: str) -> None:
-    warnings.warn(message, stacklevel=3)
-
-
-def _check_geometry(vertices: Tensor, faces: Tensor) -> None:
+def check_geometry(vertices: Tensor, faces: Tensor) -> None:
+    """Raise MeshError unless vertices (V, 3) and faces (F, 3) are a mesh that lies at its origin."""
     if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
         raise MeshError(
             f"vertices and faces must have shapes (V, 3) and (F, 3), got {tuple(vertices.shape)} and "
@@ -231,8 +158,17 @@ def _check_geometry(vertices: Tensor, faces: Tensor) -> None:
         raise MeshError(
             f"faces refer to vertices {int(faces.min())} to {int(faces.max())}, but there are {len(vertices)}"
         )
-    if float((vertices.amax(0) - vertices.amin(0)).max()) == 0.0:
+    low, high = vertices.double().amin(0), vertices.double().amax(0)
+    size, centre = float(torch.linalg.vector_norm(high - low)), (low + high) / 2
+    if size == 0.0:
         raise MeshError("the mesh has no extent: all vertices are at one place")
+    distance = float(torch.linalg.vector_norm(centre))
+    if distance > _MOST_DISTANT * size:
+        raise MeshError(
+            f"the mesh lies {distance:.4g} from its origin, {distance / size:.3g} times its size of {size:.4g}, "
+            f"where single precision would blur it and its poses by {distance * 6e-8:.2g}: subtract its centre "
+            f"{[round(x, 4) for x in centre.tolist()]} from the vertices"
+        )
 
 
 def _check_appearance(
@@ -249,49 +185,6 @@ def _check_appearance(
         raise MeshError(f"texture must have shape (3, h, w), got {tuple(texture.shape)}")
     if uv is None:
         raise MeshError("a texture needs texture coordinates: uv is missing")
-
-
-def _clean(arrays: MeshArrays, path: Path) -> MeshArrays:
-    """Drop faces that are degenerate or there twice and vertices without a face; warn about what matters."""
-    triangles = arrays.vertices[arrays.faces]
-    doubled_area = np.linalg.norm(
-        np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1
-    )
-    extent = float(np.ptp(arrays.vertices, axis=0).max())
-    solid = doubled_area > 1e-14 * extent**2
-    # Seams split vertices; topology is judged on places.
-    place = np.unique(arrays.vertices, axis=0, return_inverse=True)[1].reshape(-1)
-    corners = np.sort(place[arrays.faces], axis=1)
-    first = np.zeros(len(corners), bool)
-    first[np.unique(corners, axis=0, return_index=True)[1]] = True
-    keep = solid & first
-    if not keep.any():
-        raise MeshError(f"all {len(keep)} faces are degenerate (zero area)")
-    if not keep.all():
-        _warn_file(
-            path,
-            f"dropped {int((~solid).sum())} degenerate and {int((solid & ~first).sum())} duplicate faces",
-        )
-    corners = corners[keep]
-    edges = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [0, 2]]])
-    shared = np.unique(edges, axis=0, return_counts=True)[1]
-    if (shared > 2).any():
-        _warn_file(
-            path,
-            f"{int((shared > 2).sum())} of {len(shared)} edges are not manifold (more than two faces meet); it is "
-            "rendered as it is, but may have inner walls or doubled surfaces",
-        )
-    used, faces = np.unique(arrays.faces[keep], return_inverse=True)
-    return arrays._replace(
-        vertices=arrays.vertices[used],
-        faces=faces.reshape(-1, 3),
-        colors=None if arrays.colors is None else arrays.colors[used],
-        uv=None if arrays.uv is None else arrays.uv[used],
-    )
-
-
-def _warn_file(path: Path, message: str) -> None:
-    warnings.warn(f"mesh {path}: {message}", stacklevel=4)
 
 
 def _convex_hull(vertices: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -13,8 +13,7 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
-from foundpose.rendering.mesh import Mesh, once_per_mesh
-from foundpose.rendering.mesh_io import PLAIN_ALBEDO
+from foundpose.rendering.mesh import PLAIN_ALBEDO, Mesh, once_per_mesh
 
 AMBIENT = 0.4
 """Share of the light that comes from everywhere; the rest comes from the camera's direction."""

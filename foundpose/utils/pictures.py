@@ -69,13 +69,18 @@ def read_picture(path: str | Path) -> Picture:
         # Telephones write MPO: a picture, and others for the depth or the preview.
         if frames > 1 and image.format != "MPO":
             raise PictureError(f"{path} holds {frames} pictures ({image.format}); save the one that is meant")
-        ImageOps.exif_transpose(image, in_place=True)
-        if image.mode in _WITH_ALPHA or (image.mode in _PLAIN and "transparency" in image.info):
-            pixels = np.asarray(image.convert("RGBA"), dtype=np.float32) / 255.0
-        elif image.mode in _PLAIN:
-            pixels = np.asarray(image.convert("RGB"), dtype=np.float32) / 255.0
-        else:
-            pixels = np.repeat(_deep(image, path)[..., None], 3, axis=2)
+        return convert_picture(image, path)
+
+
+def convert_picture(image: Image.Image, path: str | Path) -> Picture:
+    """What a picture that Pillow has opened shows, see :func:`read_picture`; ``path`` is for messages."""
+    ImageOps.exif_transpose(image, in_place=True)
+    if image.mode in _WITH_ALPHA or (image.mode in _PLAIN and "transparency" in image.info):
+        pixels = np.asarray(image.convert("RGBA"), dtype=np.float32) / 255.0
+    elif image.mode in _PLAIN:
+        pixels = np.asarray(image.convert("RGB"), dtype=np.float32) / 255.0
+    else:
+        pixels = np.repeat(_deep(image, path)[..., None], 3, axis=2)
     values = torch.from_numpy(pixels).permute(2, 0, 1).contiguous()
     return Picture(values[:3], values[3] if len(values) == 4 else None)
 

@@ -10,7 +10,7 @@ from foundpose.bop.vsd import distance_images, visible_surfaces, vsd
 from foundpose.bop.vsd_image import DepthImage, DepthObject, PosedObject, vsd_of_pairs
 from foundpose.geometry import se3_exp
 from foundpose.rendering import RaycastRenderer
-from foundpose.rendering.mesh_io import read_mesh_file
+from foundpose.rendering.mesh_files import read_mesh_file
 from foundpose.synthetic import procedural_mesh
 
 TAUS = [0.05 + 0.05 * k for k in range(10)]

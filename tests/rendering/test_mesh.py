@@ -9,9 +9,10 @@ import torch
 import trimesh
 from PIL import Image
 from scipy.spatial.distance import pdist
+from trimesh.visual.color import linear_to_srgb
 
 from foundpose.geometry.cameras import intrinsics_matrix
-from foundpose.rendering import Mesh, MeshError, RaycastRenderer, load_mesh, warn_if_scale_implausible
+from foundpose.rendering import Mesh, MeshError, RaycastRenderer, load_mesh
 from tests.rendering.scenes import look_at, square
 
 QUADRANTS = {(20, 20): (1, 0, 0), (20, 44): (0, 1, 0), (44, 20): (0, 0, 1), (44, 44): (1, 1, 0)}
@@ -59,9 +60,10 @@ def test_vertex_colours_round_trip(tmp_path: Path, suffix: str) -> None:
     original.export(path)
     mesh = load_mesh(path)
     nearest = torch.cdist(mesh.vertices.double(), torch.tensor(original.vertices)).argmin(1)
-    torch.testing.assert_close(
-        mesh.vertex_colors, torch.tensor(colors[nearest, :3] / 255.0).float(), atol=2e-3, rtol=0
-    )
+    expected = colors[nearest, :3] / 255.0
+    if suffix == "glb":  # whose numbers are light
+        expected = linear_to_srgb(expected)
+    torch.testing.assert_close(mesh.vertex_colors, torch.tensor(expected).float(), atol=2e-3, rtol=0)
 
 
 def test_obj_texture(tmp_path: Path) -> None:
@@ -84,7 +86,9 @@ def test_glb_base_color_factor(tmp_path: Path) -> None:
     material = trimesh.visual.material.PBRMaterial(baseColorFactor=[51, 102, 255, 255])
     textured_square(material).export(tmp_path / "quad.glb")
     mesh = load_mesh(tmp_path / "quad.glb")
-    torch.testing.assert_close(mesh.vertex_colors, torch.tensor([[0.2, 0.4, 1.0]]).repeat(4, 1))
+    torch.testing.assert_close(
+        mesh.vertex_colors, torch.tensor([[0.4845, 0.6652, 1.0]]).repeat(4, 1), atol=2e-4, rtol=0
+    )
 
 
 def test_scene_with_several_materials(tmp_path: Path) -> None:
@@ -231,14 +235,6 @@ def test_absurd_scale(tmp_path: Path) -> None:
     huge.export(tmp_path / "huge.stl")
     with pytest.warns(UserWarning, match="very large.*micrometres"):
         load_mesh(tmp_path / "huge.stl")
-    mesh = square()  # diameter 2.8
-    with pytest.warns(UserWarning, match=r"likely in metres and the camera distance .* in millimetres"):
-        warn_if_scale_implausible(mesh, distance=2500.0)
-    with pytest.warns(UserWarning, match=r"likely in millimetres and the camera distance .* in metres"):
-        warn_if_scale_implausible(mesh, distance=0.01)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        warn_if_scale_implausible(mesh, distance=10.0)
 
 
 def test_diameter_is_the_largest_vertex_distance() -> None:
