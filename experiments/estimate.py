@@ -37,7 +37,7 @@ from foundpose.evaluation.records import (
     to_results,
 )
 from foundpose.evaluation.report import in_words, unanswered
-from foundpose.geometry import boxes_from_xywh, intrinsics_matrix, masks_from_boxes
+from foundpose.geometry import Camera, boxes_from_xywh, check_camera, masks_from_boxes, read_camera
 from foundpose.pipeline.results import PoseEstimates
 from foundpose.rendering import Mesh, Renderer, load_mesh
 from foundpose.representation import ObjectRepresentation
@@ -63,25 +63,8 @@ def estimate_picture(cfg: DictConfig, output: Path) -> None:
     for name in ("mesh", "intrinsics"):
         if cfg[name] is None:
             raise ValueError(f"with image=… give {name}=… too")
-    if (cfg.mask is None) == (cfg.box is None):
-        raise ValueError("give either mask=… (a picture) or box=[x,y,width,height]")
-    fx, fy, cx, cy = numbers(cfg, "intrinsics", "[fx,fy,cx,cy]", 4)
-    if min(fx, fy) <= 0:
-        raise ValueError(f"focal lengths must be positive, got fx={fx}, fy={fy}")
-    K = intrinsics_matrix(fx, fy, cx, cy)
-    image = read_image(cfg.image, cfg.background)
-    height, width = image.shape[1:]
-    if cfg.mask is not None:
-        mask = read_mask(cfg.mask, (height, width), cfg.largest_component)
-    else:
-        box = numbers(cfg, "box", "[x,y,width,height]", 4)
-        mask = masks_from_boxes(boxes_from_xywh(torch.tensor([box])), height, width)[0]
-        if not bool(mask.any()):
-            raise ValueError(f"box {box} holds no pixel of the image, which is {width}x{height} px")
-    if cfg.distortion is not None:
-        image, mask = undistort(image, mask, K, numbers(cfg, "distortion", "[k1,k2,p1,p2,…]"))
-
-    mesh = load_mesh(cfg.mesh)
+    image, K, mask = read_view(cfg)
+    mesh = load_mesh(cfg.mesh, cfg.color)
     claim_run_folder(output, cfg)
     method = build_method(cfg)
     name = Path(cfg.mesh).stem
@@ -102,6 +85,42 @@ def estimate_picture(cfg: DictConfig, output: Path) -> None:
         sys.exit(1)
 
 
+def read_view(cfg: DictConfig) -> tuple[Tensor, Tensor, Tensor]:
+    """The picture (3, H, W), its intrinsics (3, 3) and the mask (H, W), without lens distortion."""
+    image = read_image(cfg.image, cfg.background)
+    size = (int(image.shape[1]), int(image.shape[2]))
+    camera = read_intrinsics(cfg, size)
+    mask = read_region(cfg, size)
+    if camera.distortion:
+        image, mask = undistort(image, mask, camera.K, camera.distortion)
+    return image, camera.K, mask
+
+
+def read_intrinsics(cfg: DictConfig, size: tuple[int, int]) -> Camera:
+    """The camera of a picture (height, width), with the distortion of the config or that of its file."""
+    given = cfg.intrinsics
+    camera = read_camera(OmegaConf.to_container(given) if OmegaConf.is_config(given) else given)
+    check_camera(camera.K, size, camera.size)
+    if cfg.distortion is not None:
+        camera = camera._replace(distortion=numbers(cfg, "distortion", "[k1,k2,p1,p2,…]"))
+    if len(camera.distortion) not in (0, 4, 5, 8, 12, 14):
+        raise ValueError(f"distortion must have 4, 5, 8, 12 or 14 coefficients, got {len(camera.distortion)}")
+    return camera
+
+
+def read_region(cfg: DictConfig, size: tuple[int, int]) -> Tensor:
+    """The mask (H, W) that the config's mask or box says."""
+    if (cfg.mask is None) == (cfg.box is None):
+        raise ValueError("give either mask=… (a picture) or box=[x,y,width,height]")
+    if cfg.mask is not None:
+        return read_mask(cfg.mask, size, cfg.largest_component)
+    box = numbers(cfg, "box", "[x,y,width,height]", 4)
+    mask = masks_from_boxes(boxes_from_xywh(torch.tensor([box])), *size)[0]
+    if not bool(mask.any()):
+        raise ValueError(f"box {box} holds no pixel of the image, which is {size[1]}x{size[0]} px")
+    return mask
+
+
 def numbers(cfg: DictConfig, name: str, form: str, count: int | None = None) -> list[float]:
     """A list of numbers of the config."""
     node = cfg[name]
@@ -114,8 +133,6 @@ def numbers(cfg: DictConfig, name: str, form: str, count: int | None = None) -> 
 
 def undistort(image: Tensor, mask: Tensor, K: Tensor, distortion: list[float]) -> tuple[Tensor, Tensor]:
     """Undo lens distortion of a picture (3, H, W) and its mask; the intrinsics stay the same."""
-    if len(distortion) not in (4, 5, 8, 12, 14):
-        raise ValueError(f"distortion must have 4, 5, 8, 12 or 14 coefficients, got {len(distortion)}")
     stacked = torch.cat([image, mask[None].to(image.dtype)])
     straight = undistort_image(stacked[None], K[None], torch.tensor([distortion]))[0]
     return straight[:3], straight[3] > 0.5
@@ -137,7 +154,7 @@ def estimate_dataset(cfg: DictConfig, output: Path) -> None:
 
     method = build_method(cfg)
     pictures = instantiate(cfg.pictures)
-    objects = DatasetObjects(dataset, method.store)
+    objects = DatasetObjects(dataset, method.store, color=cfg.color)
     objects.onboard(sorted({i.obj_id for key in images for i in by_image[key]}), ProgressBars)
 
     entries: list[dict[str, Any]] = []

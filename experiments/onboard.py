@@ -13,7 +13,7 @@ from omegaconf import DictConfig
 
 from foundpose.bop import BopDataset
 from foundpose.config import Method, build_method, clear_errors, wanted_objects
-from foundpose.rendering import load_mesh
+from foundpose.rendering import Mesh, load_mesh
 from foundpose.utils.progress import ProgressBars
 from foundpose.utils.timing import StageTimer
 
@@ -33,12 +33,11 @@ def main(cfg: DictConfig) -> None:
         files = meshes_to_onboard(cfg)
         method = build_method(cfg)
         for name, file in files.items():
-            onboard(method, name, file)
+            onboard(method, name, load_mesh(file, cfg.color))
 
 
-def onboard(method: Method, name: str, file: Path) -> None:
+def onboard(method: Method, name: str, mesh: Mesh) -> None:
     """Onboard one mesh unless that has been done."""
-    mesh = load_mesh(file)
     onboarder = method.onboarder
     known = method.store.has(mesh, name)
     on_cpu = StageTimer({"rendering": onboarder.renderer}, synchronize=False)

@@ -34,8 +34,15 @@ def parse_intrinsics(entry: Any, where: str) -> Tensor:
     """Intrinsics (3, 3) float64 of an entry of ``scene_camera.json``, pixels.
 
     Raises:
-        BopError: ``cam_K`` is missing or no matrix of intrinsics.
+        BopError: ``cam_K`` is missing or no matrix of intrinsics, or the camera has another model (fisheye).
     """
+    if isinstance(entry, Mapping) and "cam_model" in entry and "cam_K" not in entry:
+        model = entry["cam_model"]
+        name = model.get("projection_model_type", model) if isinstance(model, Mapping) else model
+        raise BopError(
+            f"{where}: fisheye cameras are not supported (cam_model in place of cam_K: {name}); undistort the "
+            "pictures to a pinhole camera and write its cam_K"
+        )
     K = _numbers(entry, "cam_K", 9, where).reshape(3, 3)
     if K[2].tolist() != [0.0, 0.0, 1.0] or K[1, 0] != 0 or not (K[0, 0] > 0 and K[1, 1] > 0):
         raise BopError(

@@ -31,6 +31,7 @@ class DatasetObjects:
         memory_limit: MiB that loaded representations may take together; None for no limit. Sizes are those of the
             files, which hold little but the tensors: what is resident once every page has been used.
         mesh_limit: MiB of meshes that are kept, the one used last in any case; None for no limit.
+        color: [red, green, blue] in [0, 1] of surfaces for which a mesh gives no colour; None: light grey.
     """
 
     def __init__(
@@ -39,6 +40,7 @@ class DatasetObjects:
         store: RepresentationStore,
         memory_limit: float | None = None,
         mesh_limit: float | None = 1024.0,
+        color: Sequence[float] | None = None,
     ) -> None:
         for name, limit in (("memory_limit", memory_limit), ("mesh_limit", mesh_limit)):
             if limit is not None and not limit > 0:
@@ -47,8 +49,9 @@ class DatasetObjects:
         self.store = store
         self.memory_limit = memory_limit
         self.mesh_limit = mesh_limit
+        self.color = color
         self._meshes: OrderedDict[int, Mesh] = OrderedDict()
-        self._checksums = MeshChecksums(store.folder, dataset)
+        self._checksums = MeshChecksums(store.folder, dataset, color)
         self._sizes: dict[int, float] = {}
         self._loaded: OrderedDict[int, ObjectRepresentation] = OrderedDict()
 
@@ -60,7 +63,7 @@ class DatasetObjects:
         """
         if obj_id not in self._meshes:
             path = self.dataset.mesh_path(obj_id)
-            mesh = load_mesh(path)
+            mesh = load_mesh(path, self.color)
             published = self.dataset.diameter(obj_id)
             check_unit(mesh.diameter, f"the diameter of {path}", published, "that in models_info.json", 2.0)
             self._meshes[obj_id] = mesh
@@ -165,11 +168,13 @@ class MeshChecksums:
     Args:
         folder: of the file.
         dataset: whose meshes.
+        color: with which they are loaded.
     """
 
-    def __init__(self, folder: Path, dataset: BopDataset) -> None:
+    def __init__(self, folder: Path, dataset: BopDataset, color: Sequence[float] | None = None) -> None:
         self.folder = folder
         self.dataset = dataset
+        self.color = color
         self._path: Path | None = None
         self._known: dict[str, str] = {}
         self._new = False
@@ -177,7 +182,9 @@ class MeshChecksums:
     def get(self, obj_id: int) -> str | None:
         """Checksum of an object's mesh; None where it is not known."""
         if self._path is None:
-            self._path = self.folder / f".{self.dataset.name}-meshes-{_state_of(self.dataset.models)}.json"
+            color = "" if self.color is None else "-".join(["", *(f"{value:g}" for value in self.color)])
+            name = f".{self.dataset.name}-meshes-{_state_of(self.dataset.models)}{color}.json"
+            self._path = self.folder / name
             if self._path.is_file():
                 self._known = json.loads(self._path.read_text())
         return self._known.get(str(obj_id))

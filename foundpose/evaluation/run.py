@@ -72,7 +72,7 @@ def _estimate(
     """Records of all instances, in the first process; None in the others."""
     masks = instantiate(cfg.masks)
     method = build_method(cfg)
-    objects = DatasetObjects(dataset, method.store, cfg.memory_limit)
+    objects = DatasetObjects(dataset, method.store, cfg.memory_limit, color=cfg.color)
     data: PoseDataModule = instantiate(
         cfg.data_module,
         dataset=dataset,

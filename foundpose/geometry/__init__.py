@@ -14,6 +14,7 @@ from foundpose.geometry.cameras import (
 )
 from foundpose.geometry.crop import Crops, PerspectiveCrop
 from foundpose.geometry.deviation import PoseDeviation, perturbed_poses, pose_deviation
+from foundpose.geometry.intrinsics import Camera, CameraError, check_camera, read_camera
 from foundpose.geometry.patch_grid import PatchGrid
 from foundpose.geometry.symmetries import (
     Symmetries,
@@ -40,6 +41,8 @@ from foundpose.geometry.viewpoints import (
 )
 
 __all__ = [
+    "Camera",
+    "CameraError",
     "Crops",
     "PatchGrid",
     "PerspectiveCrop",
@@ -53,6 +56,7 @@ __all__ = [
     "boxes_from_points",
     "boxes_from_xywh",
     "camera_on_boxes",
+    "check_camera",
     "discretise",
     "intrinsics_matrix",
     "invert_transform",
@@ -66,6 +70,7 @@ __all__ = [
     "pose_deviation",
     "project_points",
     "project_to_rotation",
+    "read_camera",
     "resize_intrinsics",
     "rotation_angle",
     "se3_exp",

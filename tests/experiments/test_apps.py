@@ -135,9 +135,15 @@ def test_own_picture_with_mask_box_and_distortion(own_picture, monkeypatch, tmp_
         (["mask=none.png"], "no image at none.png"),
         (["box=[1,2,3]"], "box must be [x,y,width,height], got [1, 2, 3]"),
         (["intrinsics=null", "box=[1,2,3,4]"], "give intrinsics=… too"),
-        (["intrinsics=[600]", "box=[1,2,3,4]"], "intrinsics must be [fx,fy,cx,cy], got [600]"),
-        (["intrinsics=600", "box=[1,2,3,4]"], "intrinsics must be [fx,fy,cx,cy], got 600"),
-        (["intrinsics=[0,0,0,0]", "box=[1,2,3,4]"], "focal lengths must be positive, got fx=0.0, fy=0.0"),
+        (
+            ["intrinsics=[600]", "box=[1,2,3,4]"],
+            "intrinsics must be [fx,fy,cx,cy] in pixels, a 3x3 matrix, or a file",
+        ),
+        (
+            ["intrinsics=600", "box=[1,2,3,4]"],
+            "or a file (BOP's camera.json, a camera_info YAML of ROS), got 600",
+        ),
+        (["intrinsics=[0,0,0,0]", "box=[1,2,3,4]"], "focal lengths must be positive, got fx=0, fy=0"),
         (["box=5"], "box must be [x,y,width,height], got 5"),
         (["box=[900,2,3,4]"], "holds no pixel of the image, which is 640x480 px"),
         (["box=[1,2,30,40]", "device=gpu"], "device must be cpu, cuda, cuda:1 or mps, got 'gpu'"),
