@@ -179,7 +179,7 @@ def test_a_file_that_is_missing(tmp_path: Path) -> None:
             (4.2, 4.2, 319.5, 239.5),
             SIZE,
             None,
-            r"field of view of 179°; a focal length in millimetres",
+            "of view of 178°; a focal length in mill",
         ),
         ("nanometres", (1e6, 1e6, 319.5, 239.5), SIZE, None, r"field of view of 0\.0367°"),
     ],
@@ -197,12 +197,12 @@ def test_cameras_of_other_pictures(
         (
             "of the full picture, with one of half its size",
             (1200, 1204, 643.5, 477.5),
-            r"\(643\.5, 477\.5\) is far from the centre .* 2\.01 times as large\? With the factor 0\.498",
+            r"\(643\.5, 477\.5\) is far from the centre .* 2 times as large\? With the factor 0\.5 they are",
         ),
         (
             "of half the picture",
             (300, 301, 159.5, 119.5),
-            r"0\.5 times as large\? With the factor 2 they are \[600,602,319",
+            r"0\.5 times as large\? With the factor 2 they are \[600",
         ),
         (
             "cut out",

@@ -53,7 +53,7 @@ def run(monkeypatch, capsys, output, **arguments) -> tuple[int, str, str]:
 
 
 def test_files_that_go_together(files, monkeypatch, capsys, tmp_path):
-    _, arguments, mesh, scene = files
+    _, arguments, _, scene = files
     status, out, err = run(monkeypatch, capsys, tmp_path, **arguments)
     assert (status, err) == (0, "")
     lines = dict(line.split(maxsplit=1) for line in out.splitlines())
