@@ -19,7 +19,7 @@ from foundpose.geometry import pose_deviation
 from foundpose.pipeline.results import PoseEstimates
 from foundpose.representation import ObjectRepresentation
 from foundpose.utils.progress import ProgressBars
-from foundpose.visualization import save_estimate_figure
+from foundpose.visualization import ShownObject, save_estimate_figure
 from scenes import KnownScene
 
 
@@ -59,9 +59,7 @@ def run(cfg: DictConfig, output: Path, extractor: str) -> bool:
         scene.K,
         estimates,
         0,
-        representation,
-        scene.mesh,
-        method.onboarder.renderer,
+        ShownObject(scene.mesh, representation, method.onboarder.renderer),
         scene.T_camera_from_model,
     )
     return judge(cfg, scene, estimates, output / "overlay.png")

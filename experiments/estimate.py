@@ -44,7 +44,7 @@ from foundpose.representation import ObjectRepresentation
 from foundpose.utils.files import write_json
 from foundpose.utils.progress import ProgressBars
 from foundpose.utils.timing import StageTimer
-from foundpose.visualization import save_estimate_figure
+from foundpose.visualization import ShownObject, save_estimate_figure
 
 
 @hydra.main(version_base="1.3", config_path="../conf", config_name="estimate")
@@ -76,7 +76,12 @@ def estimate_picture(cfg: DictConfig, output: Path) -> None:
     write_json(output / "estimate.json", facts)
     write_results(output / "results.csv", to_results([facts | {"scene_id": 0, "im_id": 0, "obj_id": 0}]))
     save_estimate_figure(
-        output / "overlay.png", image, K, estimates, 0, representation, mesh, method.onboarder.renderer
+        output / "overlay.png",
+        image,
+        K,
+        estimates,
+        0,
+        ShownObject(mesh, representation, method.onboarder.renderer),
     )
     print(json.dumps(facts, indent=1))
     print(f"written to {output}")
@@ -238,7 +243,9 @@ def save_overlays(
     for i, instance in enumerate(members):
         mesh, representation = objects[instance.obj_id]
         name = f"{instance.scene_id:06d}_{instance.im_id:06d}_{instance.obj_id:06d}_{i}.png"
-        save_estimate_figure(folder / name, photograph, K, estimates, i, representation, mesh, renderer)
+        save_estimate_figure(
+            folder / name, photograph, K, estimates, i, ShownObject(mesh, representation, renderer)
+        )
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """One figure that tells how a pose came about."""
 
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from matplotlib.axes import Axes
@@ -20,24 +21,18 @@ _MOST_LINES = 60
 _MOST_TEMPLATES = 7
 
 
-def overlay_pose(
-    image: Tensor,
-    K: Tensor,
-    mesh: Mesh,
-    renderer: Renderer,
-    T_coarse: Tensor,
-    T_refined: Tensor | None = None,
-    T_true: Tensor | None = None,
-) -> Tensor:
-    """Draw contours (truth: red, coarse: blue, refined: green) on a picture (3, H, W), and the final pose's axes."""
-    size = (int(image.shape[1]), int(image.shape[2]))
-    drawn = image
-    for T, color in ((T_true, TRUTH), (T_coarse, COARSE), (T_refined, REFINED)):
-        if T is not None:
-            mask = renderer(mesh, T[None].float(), K[None].float(), size).mask[0].to(image.device)
-            drawn = draw_contour(drawn, mask, color)
-    final = T_coarse if T_refined is None else T_refined
-    return draw_axes(drawn, final, K, length=0.5 * float(mesh.diameter))
+class ShownObject(NamedTuple):
+    """An object of a figure.
+
+    Attributes:
+        mesh: its mesh.
+        representation: made of the mesh.
+        renderer: draws contours and templates.
+    """
+
+    mesh: Mesh
+    representation: ObjectRepresentation
+    renderer: Renderer
 
 
 @torch.no_grad()
@@ -47,12 +42,12 @@ def save_estimate_figure(
     K: Tensor,
     estimates: PoseEstimates,
     index: int,
-    representation: ObjectRepresentation,
-    mesh: Mesh,
-    renderer: Renderer,
+    shown: ShownObject,
     T_true: Tensor | None = None,
 ) -> None:
     """Write a figure: pose on the picture and closer, crop, retrieved templates, matches of the best template.
+
+    Contours are red (truth), blue (coarse pose) and green (refined).
 
     Args:
         path: a picture file.
@@ -60,57 +55,58 @@ def save_estimate_figure(
         K: (3, 3) its intrinsics.
         estimates: a batch of estimates.
         index: which estimate to show.
-        representation: the object it belongs to.
-        mesh: the object's mesh.
-        renderer: draws contours and templates.
+        shown: the object it belongs to.
         T_true: (4, 4) true pose, or None.
     """
     e = estimates
+    mesh, representation, renderer = shown
     templates = e.templates.index[index].cpu()
     best = int(e.best[index])
-    size = representation.info.image_size
     views = renderer(
         mesh,
         representation.T_template_from_model[templates].float().cpu(),
         representation.K_template[templates].float().cpu(),
-        (size, size),
+        (representation.info.image_size, representation.info.image_size),
     ).rgb
     status = PoseStatus(int(e.status[index]))
+    poses: list[tuple[str, Color, Tensor]] = []
+    if bool(e.valid[index]):
+        poses = [] if T_true is None else [("truth", TRUTH, T_true)]
+        poses.append(("coarse", COARSE, e.T_coarse[index].cpu()))
+        if e.refined is not None:
+            poses.append(("refined", REFINED, e.T_camera_from_model[index].cpu()))
+    drawn = image
+    for _, color, T in poses:
+        size = (int(image.shape[1]), int(image.shape[2]))
+        drawn = draw_contour(
+            drawn, renderer(mesh, T[None].float(), K[None].float(), size).mask[0].to(image.device), color
+        )
 
     figure = Figure(figsize=(14, 11), layout="constrained")
     grid = figure.add_gridspec(3, 1, height_ratios=[5.3, 2.6, 5])
     top, middle, bottom = (figure.add_subfigure(grid[row, 0]) for row in range(3))
     left, middle_top, right = top.subplots(1, 3, width_ratios=[image.shape[2] / image.shape[1], 1, 1])
-    drawn = image
-    if bool(e.valid[index]):
-        coarse = e.T_coarse[index].cpu()
-        refined = None if e.refined is None else e.T_camera_from_model[index].cpu()
-        drawn = overlay_pose(image, K, mesh, renderer, coarse, refined, T_true)
-        shown_poses = [("truth", TRUTH, T_true), ("coarse", COARSE, coarse), ("refined", REFINED, refined)]
-        _explain(middle_top, [(name, color) for name, color, T in shown_poses if T is not None])
+    if poses:
+        drawn = draw_axes(drawn, poses[-1][2], K, length=0.5 * mesh.diameter)
+        lines = [Line2D([], [], color=color, linewidth=3, label=name) for name, color, _ in poses]
+        middle_top.legend(handles=lines, loc="upper right", fontsize=9, framealpha=0.8)
     _show(left, drawn, f"{representation.info.name}: {status.name}, {int(e.num_inliers[index])} inliers")
     _show(middle_top, drawn, "the same, closer (axes of the model: x red, y green, z blue)")
-    if bool(e.valid[index]):
-        _look_closer(middle_top, K, mesh, [T for _, _, T in shown_poses if T is not None])
+    if poses:
+        _look_closer(middle_top, K, mesh, [T for _, _, T in poses])
     crop = draw_contour(
         e.crops.images[index].cpu(), e.crops.masks[index].cpu() > 0.5, (1.0, 1.0, 1.0), width=1
     )
     _show(right, crop, "crop, outline of the mask white")
     middle.suptitle("retrieved templates: their similarity, and inliers of their poses", fontsize=9)
-    shown = sorted({*range(min(len(templates), _MOST_TEMPLATES)), best})
-    for rank, axes in zip(shown, middle.subplots(1, len(shown), squeeze=False)[0], strict=True):
+    ranks = sorted({*range(min(len(templates), _MOST_TEMPLATES)), best})
+    for rank, axes in zip(ranks, middle.subplots(1, len(ranks), squeeze=False)[0], strict=True):
         inliers = int(e.hypotheses.num_inliers[index, rank])
         similarity = float(e.templates.similarity[index, rank])
         _show(axes, views[rank], f"{similarity:.2f}, {inliers} inliers" + (" (best)" if rank == best else ""))
     if e.correspondences is not None:
         _show_matches(bottom.subplots(1, 1), e, e.correspondences, index, views[best])
     write_atomically(Path(path), lambda temporary: figure.savefig(temporary, dpi=70))
-
-
-def _explain(axes: Axes, contours: list[tuple[str, Color]]) -> None:
-    """Say which contour is which."""
-    lines = [Line2D([], [], color=color, linewidth=3, label=name) for name, color in contours]
-    axes.legend(handles=lines, loc="upper right", fontsize=9, framealpha=0.8)
 
 
 def _look_closer(axes: Axes, K: Tensor, mesh: Mesh, poses: list[Tensor]) -> None:

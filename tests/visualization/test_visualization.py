@@ -6,7 +6,7 @@ from scipy.ndimage import binary_dilation
 from foundpose import PoseStatus
 from foundpose.geometry import intrinsics_matrix
 from foundpose.rendering import CoordinateRenderer, RaycastRenderer
-from foundpose.visualization import TRUTH, draw_axes, draw_contour, save_estimate_figure
+from foundpose.visualization import TRUTH, ShownObject, draw_axes, draw_contour, save_estimate_figure
 from tests.pipeline.test_foundpose import SIZE, K, make_pipeline, pose_at
 
 
@@ -43,7 +43,8 @@ def test_figure_of_a_good_and_of_a_failed_estimate(blob, oracle_blob, tmp_path):
     assert e.status.tolist() == [PoseStatus.OK, PoseStatus.UNUSABLE_MASK]
     for index in (0, 1):
         path = tmp_path / f"{index}.png"
-        save_estimate_figure(path, render.rgb[0], K, e, index, oracle_blob, blob, RaycastRenderer(), T)
+        shown = ShownObject(blob, oracle_blob, RaycastRenderer())
+        save_estimate_figure(path, render.rgb[0], K, e, index, shown, T)
         picture = np.asarray(Image.open(path).convert("RGB"))
         assert picture.shape[0] > 500
         assert picture.std() > 10
