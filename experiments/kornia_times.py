@@ -11,14 +11,12 @@ import torch
 import torch.nn.functional as F
 from kornia.geometry.camera import project_points as kornia_project_points
 from kornia.geometry.liegroup import Se3
-from kornia.geometry.linalg import inverse_transformation
 from kornia.geometry.linalg import transform_points as kornia_transform_points
 from kornia.geometry.transform import pyrdown, warp_perspective
 from torch import Tensor
 
 from foundpose.geometry import (
     intrinsics_matrix,
-    invert_transform,
     project_points,
     se3_exp,
     transform_points,
@@ -66,11 +64,6 @@ def main() -> None:
             "80 × 300 points projected: `project_points` | kornia's",
             lambda: project_points(camera, K),
             lambda: _kornia_pixels(camera, K),
-        ),
-        (
-            "80 rigid motions inverted: `invert_transform` | `inverse_transformation`",
-            lambda: invert_transform(T),
-            lambda: inverse_transformation(T),
         ),
     ]
     print("| operation: ours, kornia's | ours | kornia's | ratio |\n|---|---|---|---|")

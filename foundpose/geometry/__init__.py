@@ -9,7 +9,6 @@ from foundpose.geometry.cameras import (
     pixel_rays,
     project_points,
     resize_intrinsics,
-    shift_intrinsics,
     unproject_pixels,
 )
 from foundpose.geometry.crop import Crops, PerspectiveCrop
@@ -74,7 +73,6 @@ __all__ = [
     "resize_intrinsics",
     "rotation_angle",
     "se3_exp",
-    "shift_intrinsics",
     "sphere_inplane_rotations",
     "stack_symmetries",
     "super_fibonacci_rotations",

@@ -3,6 +3,8 @@
 import torch
 from torch import Tensor
 
+from foundpose.geometry.transforms import make_transform
+
 
 def project_points(points_camera: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
     """Project points in the camera frame to pixels.
@@ -54,16 +56,6 @@ def pixel_grid(height: int, width: int, device: torch.device, dtype: torch.dtype
         indexing="ij",
     )
     return torch.stack([u, v], dim=-1)
-
-
-def shift_intrinsics(K: Tensor, left_top: Tensor) -> Tensor:
-    """Intrinsics after cutting pixels off: (..., 3, 3) and (..., 2) → (..., 3, 3), ``c' = c - left_top``.
-
-    Differentiable w.r.t. both arguments.
-    """
-    shift = torch.zeros_like(K)
-    shift[..., :2, 2] = left_top
-    return K - shift
 
 
 def resize_intrinsics(K: Tensor, scale: float) -> Tensor:
@@ -122,17 +114,9 @@ def camera_on_boxes(boxes: Tensor, K: Tensor, size: int, fill: float) -> tuple[T
         width and height tie for the longer side, half of either's gradient).
     """
     left, top, right, bottom = boxes.unbind(-1)
-    corners = torch.stack(
-        [
-            torch.stack([left, top], -1),
-            torch.stack([right, top], -1),
-            torch.stack([right, bottom], -1),
-            torch.stack([left, bottom], -1),
-            torch.stack([(left + right) / 2, (top + bottom) / 2], -1),
-        ],
-        dim=-2,
-    )
-    rays = pixel_rays(corners, K)
+    u = torch.stack([left, right, right, left, (left + right) / 2], dim=-1)
+    v = torch.stack([top, top, bottom, bottom, (top + bottom) / 2], dim=-1)
+    rays = pixel_rays(torch.stack([u, v], dim=-1), K)
     R = axis_rotation_to_ray(rays[..., 4, :])
     turned = rays[..., :4, :] @ R.transpose(-1, -2)
     plane = turned[..., :2] / turned[..., 2:]
@@ -141,7 +125,4 @@ def camera_on_boxes(boxes: Tensor, K: Tensor, size: int, fill: float) -> tuple[T
     centre = torch.full_like(focal, (size - 1) / 2)
     zero, one = torch.zeros_like(focal), torch.ones_like(focal)
     K_crop = torch.stack([focal, zero, centre, zero, focal, centre, zero, zero, one], dim=-1)
-    T = torch.zeros(*R.shape[:-2], 4, 4, device=R.device, dtype=R.dtype)
-    T[..., :3, :3] = R
-    T[..., 3, 3] = 1.0
-    return K_crop.reshape(*focal.shape, 3, 3), T
+    return K_crop.reshape(*focal.shape, 3, 3), make_transform(R, torch.zeros_like(R[..., 0]))

@@ -7,6 +7,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from foundpose.geometry.cameras import pixel_grid
+
 
 class PatchGrid(NamedTuple):
     """A square grid of patches: patch (row, column) is centred at pixel ``stride · (column, row) + offset``.
@@ -28,9 +30,7 @@ class PatchGrid(NamedTuple):
 
     def centers(self, device: torch.device, dtype: torch.dtype) -> Tensor:
         """Pixel coordinates (size, size, 2) of the patch centres as ``(u, v)``."""
-        axis = torch.arange(self.size, device=device, dtype=dtype) * self.stride + self.offset
-        v, u = torch.meshgrid(axis, axis, indexing="ij")
-        return torch.stack([u, v], dim=-1)
+        return pixel_grid(self.size, self.size, device, dtype) * self.stride + self.offset
 
     def to_map(self, pixels: Tensor) -> Tensor:
         """Pixels in the grid's own coordinates, in which patch (row, column) lies at ``(column, row)``."""

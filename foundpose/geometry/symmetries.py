@@ -56,35 +56,21 @@ class Symmetries(NamedTuple):
         Raises:
             ValueError: something disagrees.
         """
-        count, axes = self.transforms.shape[1:2], self.axes.shape[1:2]
-        wanted = [
-            (batch, *count, 4, 4),
-            (batch, *count),
-            (batch, *axes, 3),
-            (batch, *axes, 3),
-            (batch, *axes),
-        ]
-        for name, value, shape in zip(self._fields, self, wanted, strict=True):
-            if value.shape != shape or count == (0,):
+        S, A = (value.shape[1] if value.dim() > 1 else 0 for value in (self.transforms, self.axes))
+        shapes = [(batch, S, 4, 4), (batch, S), (batch, A, 3), (batch, A, 3), (batch, A)]
+        forms = ["(B, S, 4, 4)", "(B, S)", "(B, A, 3)", "(B, A, 3)", "(B, A)"]
+        for name, value, shape, form in zip(self._fields, self, shapes, forms, strict=True):
+            if value.shape != shape or S == 0:
                 raise ValueError(
-                    f"symmetries.{name} must have shape {_SHAPES[name]} with B = {batch} and S at least 1, got "
+                    f"symmetries.{name} must have shape {form} with B = {batch} and S at least 1, got "
                     f"{tuple(value.shape)} (Symmetries.gather gives one entry for each pose)"
                 )
-            dtype = torch.bool if name in ("valid", "axis_valid") else like.dtype
+            dtype = torch.bool if name.endswith("valid") else like.dtype
             if value.dtype != dtype or value.device != like.device:
                 raise ValueError(
                     f"symmetries.{name} must be {dtype} on {like.device}, got {value.dtype} on {value.device} "
                     "(Symmetries.to converts)"
                 )
-
-
-_SHAPES = {
-    "transforms": "(B, S, 4, 4)",
-    "valid": "(B, S)",
-    "axes": "(B, A, 3)",
-    "origins": "(B, A, 3)",
-    "axis_valid": "(B, A)",
-}
 
 
 def no_symmetries(
@@ -93,14 +79,8 @@ def no_symmetries(
     """Symmetries of objects that have none: the identity alone."""
     if batch < 0:
         raise ValueError(f"batch must not be negative, got {batch}")
-    axes = torch.zeros(batch, 0, 3, device=device, dtype=dtype)
-    return Symmetries(
-        torch.eye(4, device=device, dtype=dtype).repeat(batch, 1, 1, 1),
-        torch.ones(batch, 1, device=device, dtype=torch.bool),
-        axes,
-        axes.clone(),
-        torch.zeros(batch, 0, device=device, dtype=torch.bool),
-    )
+    index = torch.zeros(batch, dtype=torch.int64)
+    return symmetries_from_models_info({}).gather(index).to(device, dtype or torch.get_default_dtype())
 
 
 def symmetries_from_models_info(entry: Mapping[str, Any]) -> Symmetries:

@@ -8,6 +8,7 @@ import math
 
 import torch
 import torch.nn.functional as F
+from kornia.geometry.linalg import inverse_transformation
 from torch import Tensor
 
 # Below this squared angle the coefficients of the exponential map are summed as power series.
@@ -36,8 +37,7 @@ def make_transform(R: Tensor, t: Tensor) -> Tensor:
 
 def invert_transform(T: Tensor) -> Tensor:
     """Invert rigid transformations: (..., 4, 4) → (..., 4, 4). Differentiable w.r.t. ``T``."""
-    R_inv = T[..., :3, :3].transpose(-1, -2)
-    return make_transform(R_inv, -(R_inv @ T[..., :3, 3:]).squeeze(-1))
+    return inverse_transformation(T.reshape(-1, 4, 4)).reshape(T.shape)
 
 
 def transform_points(T_b_from_a: Tensor, points_a: Tensor) -> Tensor:

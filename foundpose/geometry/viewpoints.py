@@ -3,7 +3,8 @@
 import math
 
 import torch
-from kornia.geometry.conversions import quaternion_to_rotation_matrix
+import torch.nn.functional as F
+from kornia.geometry.conversions import axis_angle_to_rotation_matrix, quaternion_to_rotation_matrix
 from torch import Tensor
 
 from foundpose.utils.settings import Configured, Setting
@@ -59,15 +60,10 @@ def sphere_inplane_rotations(num_views: int = 57, num_inplane: int = 14) -> Tens
     # Any frame about the direction serves: the in-plane angles sweep it evenly.
     pole = torch.zeros_like(forward)
     pole.scatter_(1, forward.abs().argmin(dim=1, keepdim=True), 1.0)
-    right = torch.linalg.cross(pole, forward)
-    right = right / torch.linalg.vector_norm(right, dim=-1, keepdim=True)
-    down = torch.linalg.cross(forward, right)
-    R_views = torch.stack([right, down, forward], dim=-2)
+    right = F.normalize(torch.linalg.cross(pole, forward), dim=-1)
+    R_views = torch.stack([right, torch.linalg.cross(forward, right), forward], dim=-2)
     angle = torch.arange(num_inplane, dtype=torch.float64) * (2.0 * math.pi / num_inplane)
-    zero, one = torch.zeros_like(angle), torch.ones_like(angle)
-    R_inplane = torch.stack(
-        [angle.cos(), -angle.sin(), zero, angle.sin(), angle.cos(), zero, zero, zero, one], dim=-1
-    ).reshape(-1, 3, 3)
+    R_inplane = axis_angle_to_rotation_matrix(F.pad(angle[:, None], (2, 0)))
     return (R_inplane[None] @ R_views[:, None]).reshape(-1, 3, 3)
 
 
