@@ -135,7 +135,7 @@ def _read_ply(path: Path, assets: Assets) -> Iterator[MeshPart]:
     with path.open("rb") as file:
         loaded = load_ply(file, resolver=assets)
     visual = loaded.get("visual")
-    image = None if visual is None else visual.material.image
+    image = None if visual is None else _from_file(visual.material.image)
     if image is not None:
         faces, _ = _triangles(loaded["faces"])
         yield MeshPart(_vertices(loaded), faces, uv=np.asarray(visual.uv, np.float64), texture=_texels(image))
@@ -163,7 +163,7 @@ def _read_obj(path: Path, assets: Assets) -> Iterator[MeshPart]:
         visual = geometry.get("visual")
         material, uv = (None, None) if visual is None else (visual.material, visual.uv)
         part = MeshPart(_vertices(geometry), _triangles(geometry["faces"])[0], uv=_matching(uv, geometry))
-        image = getattr(material, "image", None)
+        image = _from_file(getattr(material, "image", None))
         kd: Any = getattr(material, "kwargs", {}).get("kd")
         if image is not None and part.uv is not None:
             # Kd beside a map is usually an exporter's default, often 0, so the map alone counts.
@@ -211,7 +211,7 @@ def _read_material(
         uv=None if uv is None or len(uv) != len(part.vertices) else np.asarray(uv, np.float64)
     )
     pbr = isinstance(material, PBRMaterial)
-    image = material.baseColorTexture if pbr else getattr(material, "image", None)
+    image = _from_file(material.baseColorTexture if pbr else getattr(material, "image", None))
     factor = material.baseColorFactor if pbr else None if material is None or image else material.main_color
     # Texture, factor and colours of vertices are multiplied.
     colors = None
@@ -223,6 +223,11 @@ def _read_material(
     if image is not None and part.uv is not None:
         return part._replace(colors=colors, texture=_texels(image))
     return part._replace(colors=colors)
+
+
+def _from_file(image: Image.Image | None) -> Image.Image | None:
+    """A material's image unless it is trimesh's own, which stands in where there is none."""
+    return None if image is None or image.format is None else image
 
 
 def _texels(image: Image.Image) -> NDArray[np.uint8]:
