@@ -5,6 +5,7 @@ import struct
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +15,7 @@ import trimesh
 from PIL import Image
 from trimesh.visual.color import linear_to_srgb
 
+from foundpose.evaluation import DatasetObjects
 from foundpose.geometry import intrinsics_matrix
 from foundpose.rendering import Mesh, MeshError, RaycastRenderer, load_mesh
 
@@ -429,3 +431,19 @@ def test_a_mesh_far_from_its_origin(tmp_path: Path) -> None:
     )
     with pytest.raises(MeshError, match=message):
         load_mesh(tmp_path / "very_far.ply")
+
+
+def test_a_datasets_colour_is_part_of_what_its_representations_are_named_after(tmp_path: Path) -> None:
+    path = stl(tmp_path, [0, 0])
+    dataset = SimpleNamespace(
+        name="plain",
+        models=tmp_path,
+        mesh_path=lambda _: path,
+        diameter=lambda _: np.sqrt(8.0),
+        object_name=lambda _: "1",
+    )
+    store = SimpleNamespace(folder=tmp_path.parent / "store", path_of=lambda checksum, _: checksum)
+    for color in (None, [1.0, 0.0, 0.0], None):
+        objects = DatasetObjects(dataset, store, color=color)
+        assert objects.path(1) == load_mesh(path, color).checksum
+        objects.onboard([])  # remembers the checksum for the next
