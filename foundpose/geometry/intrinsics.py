@@ -91,7 +91,7 @@ def check_camera(K: Tensor, size: tuple[int, int], of_size: tuple[int, int] | No
     if max(abs(off_u), abs(off_v)) > 0.2:
         warn_caller(
             f"the principal point ({cx:.6g}, {cy:.6g}) is far from the centre of the picture of {width}x{height} px"
-            + _rescaled(K, width / (2 * cx + 1), height / (2 * cy + 1))
+            + _rescaled(K, width / max(2 * cx + 1, 1e-6), height / max(2 * cy + 1, 1e-6))
             + "; for a part cut out of a larger picture it may be right"
         )
     elif abs(math.log(fx / fy)) > 0.2:
@@ -106,7 +106,7 @@ def _unlikely(fx: float, fy: float, cx: float, cy: float, size: tuple[int, int])
 
 def _rescaled(K: Tensor, across: float, down: float) -> str:
     """What to give for a picture of another size, where one factor fits both sides."""
-    if min(across, down) <= 0 or not 0.95 < across / down < 1.05:
+    if max(across, down) > 100 or not 0.95 < across / down < 1.05:
         return ""
     factor = 0.5 * (across + down)
     simple = float(Fraction(factor).limit_denominator(8))

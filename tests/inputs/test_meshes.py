@@ -15,7 +15,7 @@ import trimesh
 from PIL import Image
 from trimesh.visual.color import linear_to_srgb
 
-from foundpose.evaluation import DatasetObjects
+from foundpose.evaluation.objects import DatasetObjects
 from foundpose.geometry import intrinsics_matrix
 from foundpose.rendering import Mesh, MeshError, RaycastRenderer, load_mesh
 
