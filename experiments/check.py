@@ -64,7 +64,7 @@ def check(cfg: DictConfig, output: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # said above
         image, K, mask = read_view(cfg)
-    crops = PerspectiveCrop(size=160, fill=0.7)(image[None], K[None], mask[None])
+    crops = PerspectiveCrop(size=96, fill=0.7)(image[None], K[None], mask[None])
     if not bool(crops.valid[0]):
         raise ValueError("the mask is too small for a crop: its box is less than 2 pixels wide and high")
     fit = fit_silhouette(mesh, crops)

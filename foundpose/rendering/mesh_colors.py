@@ -185,10 +185,13 @@ def _read_scene(path: Path, assets: Assets) -> Iterator[MeshPart]:
     encode: Callable[[Array], Array] = (
         linear_to_srgb if path.suffix.lower() in (".glb", ".gltf") else np.asarray
     )
-    for geometry in scene.dump():
+    for node in scene.graph.nodes_geometry:
+        transform, name = scene.graph[node]
+        geometry = scene.geometry[name]
         if not isinstance(geometry, trimesh.Trimesh):
             continue
-        part = MeshPart(np.asarray(geometry.vertices, np.float64), np.asarray(geometry.faces, np.int64))
+        vertices = trimesh.transform_points(geometry.vertices, transform)
+        part = MeshPart(vertices, np.asarray(geometry.faces, np.int64))
         visual = geometry.visual
         if isinstance(visual, trimesh.visual.TextureVisuals):
             yield _read_material(part, visual, encode)
