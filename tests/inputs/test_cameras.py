@@ -242,7 +242,7 @@ def test_scenes_of_a_fisheye_camera(model: object) -> None:
 
 @pytest.mark.parametrize("count", [4, 5, 8, 12, 14])
 def test_undistortion_is_opencvs(rng, count: int) -> None:
-    all_14 = [0.12, -0.25, 0.002, -0.001, 0.05, 0.03, -0.02, 0.01, 0.002, -0.003, 0.001, 0.002, 0.02, -0.03]
+    all_14 = [0.3, -0.25, 0.002, -0.001, 0.05, 0.03, -0.02, 0.01, 0.002, -0.003, 0.001, 0.002, 0.02, -0.03]
     coefficients = np.array(all_14[:count])
     image = cv2.GaussianBlur(rng.random((120, 160, 3)).astype(np.float32), (0, 0), 3)
     camera = np.array([[150.0, 0, 80.5], [0, 152.0, 58.5], [0, 0, 1]])
@@ -253,5 +253,5 @@ def test_undistortion_is_opencvs(rng, count: int) -> None:
         torch.from_numpy(coefficients)[None],
     )[0].permute(1, 2, 0)
     inside = np.s_[8:-8, 8:-8]  # cv2 interpolates with 1/32 px, and blends with black at the border
-    assert np.abs(ours.numpy() - expected)[inside].max() < 5e-3
-    assert np.abs(image - expected)[inside].max() > 0.02
+    assert np.abs(ours.numpy() - expected)[inside].max() < 2e-3
+    assert np.abs(image - expected)[inside].max() > 0.05
