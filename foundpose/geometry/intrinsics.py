@@ -94,14 +94,14 @@ def check_camera(K: Tensor, size: tuple[int, int], of_size: tuple[int, int] | No
             + _rescaled(K, width / max(2 * cx + 1, 1e-6), height / max(2 * cy + 1, 1e-6))
             + "; for a part cut out of a larger picture it may be right"
         )
-    elif abs(math.log(fx / fy)) > 0.2:
+    elif abs(math.log(fx) - math.log(fy)) > 0.2:
         warn_caller(f"focal lengths of fx={fx:.6g} and fy={fy:.6g} px mean pixels that are far from square")
 
 
 def _unlikely(fx: float, fy: float, cx: float, cy: float, size: tuple[int, int]) -> float:
     """How far from an ordinary camera's intrinsics are: principal point off the centre, pixels not square."""
     off = max(abs(cx / size[1] - 0.5), abs(cy / size[0] - 0.5))
-    return max(off, abs(math.log(fx / fy)))
+    return max(off, abs(math.log(fx) - math.log(fy)))
 
 
 def _rescaled(K: Tensor, across: float, down: float) -> str:
@@ -124,7 +124,7 @@ def _matrix(values: Any, name: str) -> Tensor:
     """K (3, 3) of 4 numbers, of 9, or of three rows of 3."""
     try:
         numbers = torch.tensor([[float(v) for v in row] if _is_list(row) else float(row) for row in values])
-    except (TypeError, ValueError, RuntimeError) as error:
+    except (TypeError, ValueError, OverflowError, RuntimeError) as error:
         raise CameraError(f"{name} must be {_FORM}, got {values}") from error
     if not bool(torch.isfinite(numbers).all()) or numbers.shape not in ((4,), (9,), (3, 3)):
         raise CameraError(f"{name} must be {_FORM}, got {values}")
@@ -147,10 +147,15 @@ def _is_list(value: Any) -> bool:
 
 
 def _read_file(path: Path) -> Camera:
-    if not path.is_file():
-        raise FileNotFoundError(f"there is no file of intrinsics {path}; intrinsics must be {_FORM}")
     try:
         text = path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise FileNotFoundError(
+            f"there is no file of intrinsics {path} ({error.strerror}); intrinsics must be {_FORM}"
+        ) from error
+    except ValueError as error:
+        raise CameraError(f"{path} is not readable as JSON or YAML: {error}") from error
+    try:
         content = json.loads(text) if path.suffix.lower() == ".json" else yaml.safe_load(text)
     except (ValueError, RecursionError, yaml.YAMLError) as error:
         hint = " (a FileStorage of OpenCV is not read)" if "opencv" in str(error).lower() else ""

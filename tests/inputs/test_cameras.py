@@ -8,6 +8,8 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from kornia.geometry.calibration import undistort_image
 
 from foundpose.bop import BopError
@@ -137,7 +139,8 @@ def test_files_that_hold_no_camera(tmp_path: Path, name: str, content: str, mess
 
 def test_a_file_that_is_missing(tmp_path: Path) -> None:
     with pytest.raises(
-        FileNotFoundError, match=r"no file of intrinsics .*lost\.json; intrinsics must be \[fx"
+        FileNotFoundError,
+        match=r"no file of intrinsics .*lost\.json \(No such file.*\); intrinsics must be \[fx",
     ):
         read_camera(str(tmp_path / "lost.json"))
 
@@ -230,6 +233,37 @@ def test_ordinary_cameras_pass_in_silence(values: tuple) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_camera(intrinsics_matrix(*values), SIZE)
+
+
+ANYTHING = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(), inner, max_size=4),
+    max_leaves=10,
+)
+NUMBERS = st.lists(st.floats() | st.integers(-3, 2000), min_size=4, max_size=4)
+
+
+@given(given_=ANYTHING | NUMBERS | st.lists(NUMBERS, min_size=3, max_size=3))
+@settings(deadline=None)
+def test_whatever_is_given_is_a_camera_or_refused_in_words(given_: object) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            camera = read_camera(given_)
+            check_camera(camera.K, SIZE)
+        except (CameraError, FileNotFoundError):
+            pass  # anything else is a mistake
+        else:
+            assert camera.K.diagonal().min() > 0
+
+
+@given(content=ANYTHING, ending=st.sampled_from(["json", "yaml"]))
+@settings(deadline=None)
+def test_whatever_a_file_holds_is_a_camera_or_refused_in_words(tmp_path_factory, content, ending) -> None:
+    path = tmp_path_factory.getbasetemp() / f"camera.{ending}"
+    path.write_text(json.dumps(content), encoding="utf-8")
+    with pytest.raises(CameraError, match=r"camera\.(json|yaml)( |:)"):
+        read_camera(path)
 
 
 @pytest.mark.parametrize("model", [{"projection_model_type": "CameraModelType.FISHEYE624"}, "fisheye"])
