@@ -60,7 +60,7 @@ def test_files_that_go_together(files, monkeypatch, capsys, tmp_path):
     assert "640x480 px (PNG, RGB), brightness" in lines["picture"]
     assert "colours of its surface" in lines["mesh"]
     assert "likely in millimetres" in lines["mesh"]
-    assert "field of view 55° x 43°" in lines["camera"]
+    assert "field of view 56° x 43°" in lines["camera"]
     assert f"{int(scene.mask.sum())} px" in lines["mask"]
     assert "the mask has the shape of the object" in lines["fit"]
     near, far = (float(word) for word in lines["fit"].split() if word.replace(".", "").isdigit())
@@ -83,7 +83,8 @@ def test_only_some_of_the_files(files, monkeypatch, capsys, tmp_path):
 def test_wrong_combinations_are_seen(files, monkeypatch, capsys, tmp_path):
     folder, arguments, *_ = files
     _, out, err = run(monkeypatch, capsys, tmp_path, **arguments | {"mask": folder / "inverse.png"})
-    assert "NOT the shape of the object" in out
+    assert "the mask has the shape of the object" not in out
+    assert "inverted" in err
     assert err.startswith("warning")
     _, out, err = run(monkeypatch, capsys, tmp_path, **arguments | {"intrinsics": "[1216,1216,639.5,479.5]"})
     assert "2 times as large? With the factor 0.5 they are [608,608,319.5,239.5]" in err
