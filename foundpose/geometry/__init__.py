@@ -9,6 +9,7 @@ from foundpose.geometry.cameras import (
     pixel_rays,
     project_points,
     resize_intrinsics,
+    shift_intrinsics,
     unproject_pixels,
 )
 from foundpose.geometry.crop import Crops, PerspectiveCrop
@@ -73,6 +74,7 @@ __all__ = [
     "resize_intrinsics",
     "rotation_angle",
     "se3_exp",
+    "shift_intrinsics",
     "sphere_inplane_rotations",
     "stack_symmetries",
     "super_fibonacci_rotations",

@@ -58,6 +58,16 @@ def pixel_grid(height: int, width: int, device: torch.device, dtype: torch.dtype
     return torch.stack([u, v], dim=-1)
 
 
+def shift_intrinsics(K: Tensor, left_top: Tensor) -> Tensor:
+    """Intrinsics after cutting pixels off: (..., 3, 3) and (..., 2) → (..., 3, 3), ``c' = c - left_top``.
+
+    Differentiable w.r.t. both arguments.
+    """
+    shift = torch.zeros_like(K)
+    shift[..., :2, 2] = left_top
+    return K - shift
+
+
 def resize_intrinsics(K: Tensor, scale: float) -> Tensor:
     """Intrinsics after resizing the image by ``scale``: ``f' = s f``, ``c' = (c + 0.5) s - 0.5``.
 

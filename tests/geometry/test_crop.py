@@ -13,6 +13,7 @@ from foundpose.geometry import (
     masks_from_boxes,
     project_points,
     resize_intrinsics,
+    shift_intrinsics,
     transform_points,
 )
 from foundpose.geometry.warp import warp_images
@@ -82,10 +83,12 @@ def test_warp_equals_kornias(dtype):
     assert (ours > 0).double().mean() > 0.5
 
 
-def test_intrinsics_of_resize():
+def test_intrinsics_of_shift_and_resize():
     K = camera()
     point = torch.tensor([[30.0, -20.0, 700.0]], dtype=torch.float64)
     uv, _ = project_points(point, K)
+    shifted, _ = project_points(point, shift_intrinsics(K, torch.tensor([7.0, 9.0])))
+    assert torch.allclose(shifted, uv - torch.tensor([7.0, 9.0]))
     resized, _ = project_points(point, resize_intrinsics(K, 0.5))
     assert torch.allclose(resized, (uv + 0.5) * 0.5 - 0.5)
 

@@ -19,6 +19,7 @@ from foundpose.geometry import (
     resize_intrinsics,
     rotation_angle,
     se3_exp,
+    shift_intrinsics,
     transform_points,
     unproject_pixels,
 )
@@ -227,6 +228,7 @@ def test_points_and_cameras_gradcheck() -> None:
         ((points, K), project_points),
         ((pixels, K), pixel_rays),
         ((pixels, depth, K), unproject_pixels),
+        ((K, pixels[:, 0]), shift_intrinsics),
         ((K,), lambda k: resize_intrinsics(k, 0.3)),
         ((torch.cat([points[0], points.new_tensor([[0.0, 0.0, 2.0]])]),), axis_rotation_to_ray),
         ((se3_exp(randn(2, 6)), points), transform_points),
