@@ -149,7 +149,8 @@ def test_the_default_is_the_papers_but_for_what_was_measured():
     assert cfg.retrieval.retriever.bow == cfg.onboarder.bow
 
 
-@pytest.mark.parametrize("name", sorted(path.stem for path in CONF.glob("*.yaml")))
+# check.yaml alone has no method.
+@pytest.mark.parametrize("name", sorted({path.stem for path in CONF.glob("*.yaml")} - {"check"}))
 def test_every_app_builds_its_method(name, tmp_path):
     cfg = load(
         name,

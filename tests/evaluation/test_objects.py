@@ -51,9 +51,9 @@ def loads(monkeypatch) -> list[str]:
     names: list[str] = []
     original = foundpose.evaluation.objects.load_mesh
 
-    def load(path: Path):
+    def load(path: Path, color=None):
         names.append(Path(path).name)
-        return original(path)
+        return original(path, color)
 
     monkeypatch.setattr(foundpose.evaluation.objects, "load_mesh", load)
     return names
