@@ -1,6 +1,7 @@
 """Results files and ground truth that are wrong in ways that used to be scored: rotations and units."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -60,14 +61,15 @@ def test_lines_without_a_rotation(tmp_path, name):
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_annotations_without_a_rotation(tiny_bop, name):
+def test_annotations_without_a_rotation(tiny_bop, tmp_path, name):
     rotation, message = REFUSED[name]
-    path = tiny_bop / "test" / "000001" / "scene_gt.json"
+    root = shutil.copytree(tiny_bop, tmp_path / "tiny")
+    path = root / "test" / "000001" / "scene_gt.json"
     truth = json.loads(path.read_text())
     truth["0"][0]["cam_R_m2c"] = rotation.ravel().tolist()
     path.write_text(json.dumps(truth))
     with pytest.raises(BopError, match=rf"image 0, annotation 0: cam_R_m2c must be a rotation.* {message}"):
-        BopDataset(tiny_bop).annotations(1, 0)
+        BopDataset(root).annotations(1, 0)
 
 
 @pytest.fixture
