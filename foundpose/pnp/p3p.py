@@ -18,8 +18,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from foundpose.geometry.transforms import make_transform, transform_points
-from foundpose.pnp.problem import MinimalSolution, PnpProblem, usable_coordinates
+from foundpose.geometry.transforms import make_transform
+from foundpose.pnp.problem import PnpProblem, usable_coordinates
 
 _CUBIC_STEPS, _POLISH_STEPS = 5, 2
 _LARGEST_SLOPE = 100.0  # x / z of a ray; no pinhole camera sees as far from its axis
@@ -63,29 +63,6 @@ def solve_p3p(problem: PnpProblem) -> P3PSolutions:
     usable = problem.valid.all(-1) & invertible
     rays = problem.rays().masked_fill(~usable[:, None, None], 0.0)
     return solve_p3p_rays(rays, problem.points_model)  # which flags three equal rays
-
-
-def solve_p3p_minimal(rays: Tensor, points_model: Tensor) -> MinimalSolution:
-    """P3P on the first three of four correspondences; the fourth chooses among the roots.
-
-    Args:
-        rays: (S, 4, 3) rays in the camera frame with z = 1, finite.
-        points_model: (S, 4, 3) mesh units, finite.
-
-    Returns:
-        A :class:`MinimalSolution`.
-    """
-    roots = solve_p3p_rays(rays[:, :3], points_model[:, :3])
-    T = roots.T_camera_from_model
-    fourth = transform_points(T, points_model[:, None, 3:]).squeeze(-2)  # (S, 4, 3)
-    ahead = roots.valid & (fourth[..., 2] > 0)
-    plane = fourth[..., :2] / torch.where(ahead, fourth[..., 2], torch.ones_like(fourth[..., 2])).unsqueeze(
-        -1
-    )
-    error = (plane - rays[:, None, 3, :2]).square().sum(-1).masked_fill(~ahead, torch.inf)
-    best = error.argmin(dim=1, keepdim=True)
-    T = torch.take_along_dim(T, best[..., None, None], dim=1).squeeze(1)
-    return MinimalSolution(T, ahead.any(1), roots.degenerate)
 
 
 def solve_p3p_rays(rays: Tensor, points_model: Tensor) -> P3PSolutions:
