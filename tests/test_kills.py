@@ -7,6 +7,7 @@ import json
 import multiprocessing
 import os
 import random
+import shutil
 import signal
 import time
 
@@ -39,6 +40,15 @@ def start(context, name, folder, root):
     job = context.Process(target=run_job, args=(name, folder, root, ready))
     job.start()
     assert ready.wait(120)
+    return job
+
+
+def kill(context, name, folder, root, moment):
+    """Start a job and kill it after so many seconds; its exit code is 0 if it had ended before."""
+    job = start(context, name, folder, root)
+    job.join(moment)
+    job.kill()
+    job.join()
     return job
 
 
@@ -76,10 +86,12 @@ def finished_files(folder):
 def test_a_killed_job_loses_nothing_that_was_done(undisturbed, context, root, tmp_path, seed):
     name, expected, seconds = undisturbed
     folder, moment = tmp_path / "job", random.Random(f"{name} {seed}").uniform(0.0, seconds)
-    job = start(context, name, folder, root)
-    time.sleep(moment)
-    os.kill(job.pid, signal.SIGKILL)
-    job.join()
+    job = kill(context, name, folder, root, moment)
+    while job.exitcode == 0:  # it was faster than when nobody disturbed it
+        shutil.rmtree(folder)
+        moment /= 2
+        job = kill(context, name, folder, root, moment)
+    assert job.exitcode == -signal.SIGKILL
     done = finished_files(folder)
     print(f"{name}, seed {seed}: killed after {moment:.2f} of {seconds:.2f} s, {len(done)} files were there")
     finish(start(context, name, folder, root), folder)
