@@ -52,3 +52,20 @@ def test_experiment_runs(name, tiny_bop, tmp_path):
     estimates = json.loads((next((tmp_path / "runs").iterdir()) / "estimates.json").read_text())
     masks = 5 if plain.masks.get("masks_per_instance", 1) == 5 else 1
     assert len(estimates) == min(masks, 2)  # there are two detections
+
+
+def test_a_row_without_megaposes_weights_says_what_it_lacks(tiny_bop, tmp_path):
+    plain = load("ablate", "experiment=table1_row08")
+    overrides = [
+        "experiment=table1_row08",
+        f"data.root={tiny_bop}",
+        f"folder={tmp_path}",
+        f"megapose.weights={tmp_path / 'absent'}",
+        "projection.num_components=16",
+        "trainer.accelerator=cpu",
+        *small_network(plain),
+    ]
+    record = run_once(load("ablate", *overrides), "table1_row08")
+    assert (record.status, record.row) == ("failed", "table1_row08")
+    assert f"no weights at {tmp_path / 'absent'}" in record.error
+    assert "refiner-rgb-653307694" in record.error
