@@ -60,9 +60,11 @@ def main(cfg: DictConfig) -> None:
 
 def estimate_picture(cfg: DictConfig, output: Path) -> None:
     """One picture, one mesh, one mask or box."""
-    for name in ("mesh", "intrinsics"):
+    for name in ("image", "mesh", "intrinsics"):
         if cfg[name] is None:
-            raise ValueError(f"with image=… give {name}=… too")
+            raise ValueError(
+                f"for a picture of your own give image=…, mesh=… and intrinsics=…; {name} is missing"
+            )
     image, K, mask = read_view(cfg)
     mesh = load_mesh(cfg.mesh, cfg.color)
     claim_run_folder(output, cfg)
@@ -92,6 +94,7 @@ def estimate_picture(cfg: DictConfig, output: Path) -> None:
 
 def read_view(cfg: DictConfig) -> tuple[Tensor, Tensor, Tensor]:
     """The picture (3, H, W), its intrinsics (3, 3) and the mask (H, W), without lens distortion."""
+    check_words(cfg)
     image = read_image(cfg.image, cfg.background)
     size = (int(image.shape[1]), int(image.shape[2]))
     camera = read_intrinsics(cfg, size)
@@ -99,6 +102,16 @@ def read_view(cfg: DictConfig) -> tuple[Tensor, Tensor, Tensor]:
     if camera.distortion:
         image, mask = undistort(image, mask, camera.K, camera.distortion)
     return image, camera.K, mask
+
+
+def check_words(cfg: DictConfig) -> None:
+    """Raise ValueError where a key that names a file or a colour holds something else."""
+    for name in ("image", "mask", "mesh", "background"):
+        if not isinstance(cfg[name], str | None) or (name == "background" and cfg[name] is None):
+            what = "a colour such as black" if name == "background" else "the name of a file"
+            raise ValueError(f"{name} must be {what}, got {cfg[name]}; put a name that is a number in quotes")
+    if not isinstance(cfg.largest_component, bool):
+        raise ValueError(f"largest_component must be true or false, got {cfg.largest_component}")
 
 
 def read_intrinsics(cfg: DictConfig, size: tuple[int, int]) -> Camera:

@@ -163,12 +163,12 @@ def claim_run_folder(folder: Path, cfg: DictConfig, may_change: tuple[str, ...] 
 def clear_errors() -> Iterator[None]:
     """Turn bad input into a line on standard error and exit status 2; HYDRA_FULL_ERROR=1 shows where it arose.
 
-    Bad input is what this library or an app refuses. A ``ValueError`` from elsewhere is a mistake
-    in a program, and goes on with its traceback.
+    Bad input is what this library or an app refuses, and files that the system does not let be read or written. A
+    ``ValueError`` from elsewhere is a mistake in a program, and goes on with its traceback.
     """
     try:
         yield
-    except (ValueError, FileNotFoundError, RendererNotAvailableError, InstantiationException) as error:
+    except (ValueError, OSError, RendererNotAvailableError, InstantiationException) as error:
         # Hydra wraps what a constructor raises.
         wrapped = isinstance(error, InstantiationException) and error.__cause__ is not None
         cause = error.__cause__ if wrapped else error
