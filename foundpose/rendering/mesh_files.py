@@ -65,8 +65,9 @@ def load_mesh(path: str | PathLike[str], color: Sequence[float] | None = None) -
 def read_mesh_file(path: Path, color: Sequence[float] | None = None) -> MeshPart:
     """All parts of a mesh file as one, nothing cleaned; arguments and errors as of :func:`load_mesh`."""
     if color is not None:
-        numbers = [c for c in color if isinstance(c, int | float) and 0.0 <= c <= 1.0]
-        if not len(color) == len(numbers) == 3:
+        given = list(color) if isinstance(color, Sequence) else []
+        numbers = [c for c in given if isinstance(c, int | float) and 0.0 <= c <= 1.0]
+        if not len(given) == len(numbers) == 3:
             raise ValueError(f"color must be [red,green,blue] in [0, 1], got {color}")
     parts = read_parts(path)
     if color is not None or any(part.colors is not None for part in parts):

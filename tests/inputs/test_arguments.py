@@ -60,6 +60,7 @@ RIGHT = {
 @settings(max_examples=300)
 @given(changed=st.dictionaries(st.sampled_from(sorted(RIGHT)), VALUES, max_size=3))
 @example(changed={})
+@example(changed={"color": False})
 @example(changed={"mask": None, "box": [float("nan"), 0, 5, 5]})
 @example(
     changed={"intrinsics": [[60, 0, 31.5], [0, 60, 23.5], [0, 0, 1]], "distortion": [0.1, 0, 0, float("inf")]}
