@@ -20,7 +20,8 @@ def small_network(cfg):
     common = ["extractor.weights=random", "extractor.seed=0"]
     if kind == "dinov2":
         return [*common, "extractor.layer=0", f"extractor.config={{{SIZES}}}"]
-    return common + SMALL_NETWORKS[kind]
+    layer = ["extractor.layer=0"] if cfg.extractor.get("layer") is not None else []
+    return common + layer + SMALL_NETWORKS[kind]
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
