@@ -64,7 +64,9 @@ class LightVariation:
             bounds = getattr(self, name)
             if len(bounds) != 2 or not 0.0 <= bounds[0] <= bounds[1]:
                 raise ValueError(f"{name} must be (low, high) with 0 <= low <= high, got {tuple(bounds)}")
-            object.__setattr__(self, name, tuple(bounds))  # files are named after it, whatever sequence was given
+            object.__setattr__(
+                self, name, tuple(bounds)
+            )  # files are named after it, whatever sequence was given
         if self.ambient[1] > 1.0 or not 0.0 <= self.tilt <= 90.0:
             raise ValueError(
                 f"ambient must not exceed 1 and tilt lie in [0, 90] degrees, got {tuple(self.ambient)} "
