@@ -62,9 +62,7 @@ def estimate_picture(cfg: DictConfig, output: Path) -> None:
     """One picture, one mesh, one mask or box."""
     for name in ("image", "mesh", "intrinsics"):
         if cfg[name] is None:
-            raise ValueError(
-                f"for a picture of your own give image=…, mesh=… and intrinsics=…; {name} is missing"
-            )
+            raise ValueError(f"for a picture of your own give {name}=… too")
     image, K, mask = read_view(cfg)
     mesh = load_mesh(cfg.mesh, cfg.color)
     claim_run_folder(output, cfg)

@@ -88,8 +88,13 @@ def _support(points: Tensor) -> Tensor:
         a, b, c = corners[:, candidates].unbind(2)
         centres = _circle_centre(a, b, c)
         reach = torch.linalg.vector_norm(centres.unsqueeze(2) - corners.unsqueeze(1), dim=-1).amax(dim=2)
-        # One of the candidates' centres is that of the smallest circle around the four, whatever the rounding.
-        reach, best = reach.nan_to_num(nan=torch.inf).min(dim=1)
+        # One of the candidates' centres is that of the smallest circle around the four, whatever the rounding. Where
+        # others share it, as of two diameters that cross in the middle, the points on the circle are the outermost.
+        reach = reach.nan_to_num(nan=torch.inf)
+        least = reach.amin(dim=1)
+        ties = reach <= least[:, None] * (1.0 + 8.0 * torch.finfo(reach.dtype).eps)
+        own = torch.linalg.vector_norm(a - centres, dim=-1)
+        reach, best = least, own.where(ties, -torch.inf).argmax(dim=1)
         active = active & (reach > radius)
         if not active.any():
             return support

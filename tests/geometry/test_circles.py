@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from foundpose.geometry.circles import smallest_enclosing_circles
@@ -34,6 +34,7 @@ def test_equals_brute_force_on_random_points(rng):
 
 @settings(max_examples=150, deadline=None)
 @given(st.lists(st.tuples(st.integers(-4, 4), st.integers(-4, 4)), min_size=2, max_size=9))
+@example([(-4, -1), (3, -3), (-3, 3), (4, 1)])  # two diameters that cross in the middle
 def test_equals_brute_force_on_grids_with_duplicates_lines_and_ties(points):
     points = np.array(points, dtype=float)
     found = smallest_enclosing_circles(torch.from_numpy(points)[None])
