@@ -18,8 +18,8 @@ from foundpose.config import Method, build_method, clear_errors
 from foundpose.geometry import pose_deviation
 from foundpose.pipeline.results import PoseEstimates
 from foundpose.representation import ObjectRepresentation
+from foundpose.utils.files import write_atomically
 from foundpose.utils.progress import ProgressBars
-from foundpose.visualization import ShownObject, save_estimate_figure
 from scenes import KnownScene
 
 
@@ -53,15 +53,7 @@ def run(cfg: DictConfig, output: Path, extractor: str) -> bool:
             meshes=scene.mesh,
         )
     say("4/4 drawing the figure")
-    save_estimate_figure(
-        output / "overlay.png",
-        scene.image,
-        scene.K,
-        estimates,
-        0,
-        ShownObject(scene.mesh, representation, method.onboarder.renderer),
-        scene.T_camera_from_model,
-    )
+    write_atomically(output / "overlay.png", estimates.draw(0, scene.T_camera_from_model).save)
     return judge(cfg, scene, estimates, output / "overlay.png")
 
 

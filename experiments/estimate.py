@@ -39,12 +39,11 @@ from foundpose.evaluation.records import (
 from foundpose.evaluation.report import in_words, unanswered
 from foundpose.geometry import Camera, boxes_from_xywh, check_camera, masks_from_boxes, read_camera
 from foundpose.pipeline.results import PoseEstimates
-from foundpose.rendering import Mesh, Renderer, load_mesh
+from foundpose.rendering import Mesh, load_mesh
 from foundpose.representation import ObjectRepresentation
-from foundpose.utils.files import write_json
+from foundpose.utils.files import write_atomically, write_json
 from foundpose.utils.progress import ProgressBars
 from foundpose.utils.timing import StageTimer
-from foundpose.visualization import ShownObject, save_estimate_figure
 
 
 @hydra.main(version_base="1.3", config_path="../conf", config_name="estimate")
@@ -75,14 +74,7 @@ def estimate_picture(cfg: DictConfig, output: Path) -> None:
     facts = pose_records(estimates)[0] | {"mesh": str(cfg.mesh), "image": str(cfg.image), "time": seconds}
     write_json(output / "estimate.json", facts)
     write_results(output / "results.csv", to_results([facts | {"scene_id": 0, "im_id": 0, "obj_id": 0}]))
-    save_estimate_figure(
-        output / "overlay.png",
-        image,
-        K,
-        estimates,
-        0,
-        ShownObject(mesh, representation, method.onboarder.renderer),
-    )
+    write_atomically(output / "overlay.png", estimates.draw(0).save)
     print(json.dumps(facts, indent=1))
     print(f"written to {output}")
     if not facts["valid"]:
@@ -186,17 +178,9 @@ def estimate_dataset(cfg: DictConfig, output: Path) -> None:
             representations = objects.representations(ids, cfg.device)
             shown = list(zip(map(objects.mesh, ids), representations, strict=True))
             estimates, seconds = run_pipeline(method, cfg.device, image, K, masks, shown, index)
-            if cfg.overlays and position % cfg.overlays == 0:
-                renderer = method.onboarder.renderer
-                save_overlays(
-                    output / "overlays",
-                    dataset,
-                    members,
-                    K,
-                    estimates,
-                    dict(zip(ids, shown, strict=True)),
-                    renderer,
-                )
+            for i, instance in enumerate(members if cfg.overlays and position % cfg.overlays == 0 else ()):
+                name = f"{scene_id:06d}_{im_id:06d}_{instance.obj_id:06d}_{i}.png"
+                write_atomically(output / "overlays" / name, estimates.draw(i).save)
             write_json(
                 path,
                 [
@@ -238,25 +222,6 @@ def run_pipeline(
             meshes=[mesh for mesh, _ in objects],
         )
     return estimates, timer.seconds["pipeline"]
-
-
-def save_overlays(
-    folder: Path,
-    dataset: BopDataset,
-    members: list[Instance],
-    K: Tensor,
-    estimates: PoseEstimates,
-    objects: dict[int, tuple[Mesh, ObjectRepresentation]],
-    renderer: Renderer,
-) -> None:
-    """One figure per instance of an image."""
-    photograph = dataset.image(members[0].scene_id, members[0].im_id)
-    for i, instance in enumerate(members):
-        mesh, representation = objects[instance.obj_id]
-        name = f"{instance.scene_id:06d}_{instance.im_id:06d}_{instance.obj_id:06d}_{i}.png"
-        save_estimate_figure(
-            folder / name, photograph, K, estimates, i, ShownObject(mesh, representation, renderer)
-        )
 
 
 if __name__ == "__main__":

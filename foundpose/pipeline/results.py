@@ -1,14 +1,18 @@
 """What the pipeline returns."""
 
 from enum import IntEnum
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from torch import Tensor
 
 from foundpose.geometry import Crops
 from foundpose.pnp import PnpStatus, PoseCandidates
-from foundpose.refinement.base import PoseProposals
+from foundpose.refinement.base import Observation, PoseProposals
 from foundpose.retrieval import QueryPatches, RetrievedTemplates
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from PIL.Image import Image
 
 
 class PoseStatus(IntEnum):
@@ -102,6 +106,7 @@ class PoseEstimates(NamedTuple):
         candidates: with a soft selection in the PnP stage, the hypotheses of all templates and samples with the
             probability of choosing each (``T_camera_from_model`` (B, h · J, 4, 4)); None without.
         refined: what the refiner made of the hypotheses that it was given, in the crop's frame; None without.
+        observation: what they were made from, for figures.
     """
 
     T_camera_from_model: Tensor
@@ -118,3 +123,26 @@ class PoseEstimates(NamedTuple):
     correspondences: Correspondences | None = None
     candidates: PoseCandidates | None = None
     refined: PoseProposals | None = None
+    observation: Observation | None = None
+
+    def draw(self, index: int, T_true: Tensor | None = None, note: str = "") -> "Image":
+        """A picture that tells how a pose came about: :func:`foundpose.pipeline.figure.draw_estimate`."""
+        from foundpose.pipeline.figure import draw_estimate
+
+        return draw_estimate(self, index, T_true, note)
+
+    def show(self, index: int, T_true: Tensor | None = None) -> "Figure":
+        """The picture of :meth:`draw` as a figure of matplotlib, which notebooks display.
+
+        Args:
+            index: which estimate to show.
+            T_true: (4, 4) true ``T_camera_from_model``, or None.
+        """
+        from matplotlib.figure import Figure
+
+        picture = self.draw(index, T_true)
+        figure = Figure(figsize=(picture.width / 100, picture.height / 100))
+        axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+        axes.imshow(picture)
+        axes.set_axis_off()
+        return figure

@@ -37,6 +37,7 @@ def choose_coarse(
         hypotheses=hypotheses,
         correspondences=found.correspondences,
         candidates=found.candidates,
+        observation=observation,
     )
 
 

@@ -1,6 +1,5 @@
-"""Overlays, template strips and matches as images."""
+"""Contours, axes and captioned tiles as pictures."""
 
-from foundpose.visualization.figure import ShownObject, save_estimate_figure
-from foundpose.visualization.overlay import COARSE, TRUTH, draw_axes, draw_contour
+from foundpose.visualization.overlay import COARSE, REFINED, TRUTH, draw_axes, draw_contour
 
-__all__ = ["COARSE", "TRUTH", "ShownObject", "draw_axes", "draw_contour", "save_estimate_figure"]
+__all__ = ["COARSE", "REFINED", "TRUTH", "draw_axes", "draw_contour"]
