@@ -62,6 +62,24 @@ def test_everything_small(monkeypatch, tmp_path, capsys):
     assert {path.name for path in tmp_path.iterdir() if path.is_dir()} <= {"plots", ".hydra"}
 
 
+def test_comparison_with_an_earlier_run(monkeypatch, tmp_path, capsys):
+    small = ["quick=true", "groups=[stages]", "batch_sizes=[1]", "measure.repeats=3"]
+    run_app(monkeypatch, *small, f"hydra.run.dir={tmp_path / 'before'}")
+    path = tmp_path / "before" / "benchmark.json"
+    content = json.loads(path.read_text())
+    for row in content["rows"]:  # as if matching had taken no time, and all else for ever
+        factor = 1e-6 if row["name"] == "matching" else 1e3
+        if row["name"] != "yardstick: all blocks":
+            row |= {name: factor * row[name] for name in ("lower", "median", "upper")}
+    path.write_text(json.dumps(content))
+    with pytest.raises(SystemExit) as stopped:
+        run_app(monkeypatch, *small, f"compare={path}", f"hydra.run.dir={tmp_path / 'now'}")
+    assert stopped.value.code == 1
+    found = [line for line in capsys.readouterr().out.splitlines() if "SLOWER" in line]
+    assert len(found) == 1
+    assert found[0].startswith("SLOWER: stages, matching, batch 1:")
+
+
 def test_other_stages_and_double_precision(monkeypatch, tmp_path):
     run_app(
         monkeypatch,
@@ -94,6 +112,7 @@ def test_other_stages_and_double_precision(monkeypatch, tmp_path):
         ("sizes.patches=5000", "patches must be at most"),
         ("device=toaster", "device must be cpu, cuda"),
         ("precision=bf15", "precision must be"),
+        ("compare=conf/benchmark.yaml", "compare must be the benchmark.json of an earlier run"),
     ],
 )
 def test_wrong_settings_give_one_line(override, message, monkeypatch, tmp_path, capsys):

@@ -3,6 +3,7 @@ import json
 import pytest
 
 from benchmarking.checks import make_checks
+from benchmarking.comparison import compare, describe, read_benchmark
 from benchmarking.curves import Curve, Point
 from benchmarking.inference import CANDIDATES, COARSE, HOOKED, REFINE_ONE, RETRIEVAL, YARDSTICK
 from benchmarking.onboarding import BAGS, KMEANS, PCA, RENDERING, WHOLE
@@ -200,3 +201,36 @@ def test_tables(result):
 )
 def test_duration(seconds, text):
     assert duration(seconds) == text
+
+
+def test_slower_stages(result):
+    before = result.as_json()
+    assert not any(change.slower for change in compare(before, before))
+    result.rows[0] = row(YARDSTICK, 1.0)  # a machine half as fast
+    result.rows[2] = row(REFINE_ONE, 0.16)  # a third slower than that
+    result.rows[3] = row(COARSE, 0.14, group="pipeline", lower=0.08)  # perhaps
+    now = result.as_json()
+    changes = {(change.name, change.batch_size): change for change in compare(before, now)}
+    assert (changes[REFINE_ONE, 1].before, changes[REFINE_ONE, 1].now) == pytest.approx((0.12, 0.16))
+    assert [change.name for change in changes.values() if change.slower] == [REFINE_ONE]
+    assert changes[HOOKED, 1].now == pytest.approx(0.4)
+    # By template or object, in passes of one crop.
+    assert changes[RENDERING, 16].before == pytest.approx(0.1)
+    lines = describe(list(changes.values()), before, now).splitlines()
+    assert lines[0].startswith(
+        f"SLOWER: stages, {REFINE_ONE}, batch 1: 12.00% → 16.00% of a forward pass (× 1.33)"
+    )
+    assert lines[1].startswith("1 of 11 stages are more than 25% slower than in 0123456789ab")
+
+
+def test_what_cannot_be_compared(result, tmp_path):
+    path = tmp_path / "benchmark.json"
+    settings = dict.fromkeys(("sizes", "num_hypotheses", "ransac_iterations", "lm_iterations"), 1)
+    settings |= {"dtype": "float32", "precision": None}
+    result.settings = settings
+    path.write_text(json.dumps(result.as_json()))
+    assert read_benchmark(path, settings)["rows"]
+    with pytest.raises(ValueError, match="its sizes is 1, and 2 here"):
+        read_benchmark(path, settings | {"sizes": 2})
+    with pytest.raises(ValueError, match="of an earlier run"):
+        read_benchmark(tmp_path / "none.json", settings)
