@@ -2,6 +2,7 @@
 
 python experiments/evaluate.py data=lmo data.root=/path/to/lmo masks=cnos
 python experiments/evaluate.py data=lmo data.root=/path/to/lmo results=submission_lmo-test.csv
+python experiments/evaluate.py data=lmo data.root=/path/to/lmo detections=detections.json
 """
 
 from pathlib import Path

@@ -1,9 +1,11 @@
 """Files of the BOP benchmark: datasets, detections and results."""
 
 from foundpose.bop.dataset import BopDataset
+from foundpose.bop.detection_scores import DetectionScores, detection_scores
 from foundpose.bop.files import BopError
 from foundpose.bop.instances import Instance, detected_instances, ground_truth_instances
 from foundpose.bop.masks import largest_component, plausible_mask, read_mask
+from foundpose.bop.precision import PosePrecision, score_pose_detections
 from foundpose.bop.results import (
     PoseResult,
     best_of_targets,
@@ -24,8 +26,10 @@ __all__ = [
     "Annotation",
     "BopDataset",
     "BopError",
+    "DetectionScores",
     "Instance",
     "PictureError",
+    "PosePrecision",
     "PoseResult",
     "Scores",
     "Target",
@@ -34,6 +38,7 @@ __all__ = [
     "check_times",
     "decode_segmentation",
     "detected_instances",
+    "detection_scores",
     "ground_truth_instances",
     "largest_component",
     "plausible_mask",
@@ -42,6 +47,7 @@ __all__ = [
     "read_mask",
     "read_results",
     "result_file_name",
+    "score_pose_detections",
     "score_results",
     "share_image_times",
     "write_results",

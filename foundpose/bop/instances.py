@@ -107,19 +107,12 @@ def detected_instances(
         raise ValueError(f"masks_per_instance must be at least 1, got {masks_per_instance}")
     if max_per_image is not None and max_per_image < 1:
         raise ValueError(f"max_per_image must be at least 1 or null, got {max_per_image}")
-    path = _single_json(Path(path))
     targets = dataset.targets() if targets is None else targets
-    # Packed while they are read: as Python objects, a file's run lengths take many times its size.
-    entries = read_json(path, _packed)
-    if not isinstance(entries, list):
-        raise BopError(f"{path} must hold a JSON list of detections, it holds {type(entries).__name__}")
+    entries, path = read_detection_file(path)
     wanted = {target[:3] for target in targets}
     found: dict[tuple[int, int, int | None], list[Instance]] = {key: [] for key in wanted}
     for position, entry in enumerate(entries):
-        where = f"{path}: entry {position}"
-        instance = _instance(entry, where, largest_component)
-        if instance.obj_id not in dataset.models_info:
-            raise BopError(f"{where} is of object {instance.obj_id}; the dataset has {dataset.object_ids}")
+        instance = _instance(entry, dataset, f"{path}: entry {position}", largest_component)
         image = (instance.scene_id, instance.im_id)
         for key in ((*image, instance.obj_id), (*image, None)):
             if key in wanted:
@@ -140,16 +133,30 @@ def _packed(entry: dict[str, Any]) -> dict[str, Any]:
     return entry
 
 
-def _instance(entry: Any, where: str, largest_component: bool) -> Instance:
-    """A detection of an entry of a file.
+def read_detection_file(path: str | Path) -> tuple[list[Any], Path]:
+    """Entries of a file of detections, or of the only one of a folder, and the file.
 
     Raises:
-        BopError: a field is missing or cannot be right.
+        FileNotFoundError: no such file.
+        BopError: not a list.
+    """
+    path = _single_json(Path(path))
+    # Packed while they are read: as Python objects, a file's run lengths take many times its size.
+    entries = read_json(path, _packed)
+    if not isinstance(entries, list):
+        raise BopError(f"{path} must hold a JSON list of detections, it holds {type(entries).__name__}")
+    return entries, path
+
+
+def check_detection(entry: Any, dataset: BopDataset, where: str) -> tuple[list[int], float, float]:
+    """Scene, image and object, score, and time of an entry of a file of detections.
+
+    Raises:
+        BopError: a field is missing or cannot be right, or the dataset has no such object.
     """
     try:
         ids = [entry[name] for name in ("scene_id", "image_id", "category_id")]
         score, time = float(entry["score"]), float(entry.get("time", 0.0))
-        segmentation = entry["segmentation"]
         if not all(type(value) is int for value in ids):
             raise TypeError(f"scene_id, image_id and category_id must be whole numbers, got {ids}")
     except (AttributeError, KeyError, TypeError, ValueError) as error:
@@ -158,8 +165,22 @@ def _instance(entry: Any, where: str, largest_component: bool) -> Instance:
         raise BopError(f"{where}: score must be finite, got {score}")
     if not 0 <= time < math.inf:
         raise BopError(f"{where}: time must be seconds, at least 0, got {time}")
+    if ids[2] not in dataset.models_info:
+        raise BopError(f"{where} is of object {ids[2]}; the dataset has {dataset.object_ids}")
+    return ids, score, time
+
+
+def _instance(entry: Any, dataset: BopDataset, where: str, largest_component: bool) -> Instance:
+    """A detection of an entry of a file.
+
+    Raises:
+        BopError: a field is missing or cannot be right.
+    """
+    ids, score, time = check_detection(entry, dataset, where)
+    if "segmentation" not in entry:
+        raise BopError(f"{where} lacks or misspells a field: {KeyError('segmentation')!r}")
     try:
-        packed = pack_segmentation(segmentation)
+        packed = pack_segmentation(entry["segmentation"])
     except BopError as error:
         raise BopError(f"{where}: {error}") from error
     return Instance(ids[0], ids[1], ids[2], score, time, packed, largest_component=largest_component)

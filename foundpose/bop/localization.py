@@ -1,6 +1,6 @@
 """Targets, annotations and estimates of an evaluation as padded tables."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -28,6 +28,7 @@ class Localization:
         annotations: (N, g) index into ``T_true``; −1 is padding.
         T_est: (R, 4, 4) float64, poses of all results.
         T_true: (A, 4, 4) float64, true poses.
+        visibility: (A,) float64, visible share of each annotated instance; 1 where it is not known.
         outside: number of results that belong to no target.
     """
 
@@ -40,6 +41,7 @@ class Localization:
     annotations: Tensor
     T_est: Tensor
     T_true: Tensor
+    visibility: Tensor
     outside: int
 
     def pairs(self) -> Tensor:
@@ -60,17 +62,29 @@ def localization(
         BopError: the split has no ground truth, or no targets.
     """
     asked = dataset.targets() if targets is None else list(targets)
-    for scene_id in sorted({target.scene_id for target in asked}):
-        if not dataset.has_ground_truth(scene_id):
-            raise BopError(
-                f"scene {scene_id} of {dataset.split} has no ground truth (scene_gt.json), so recall cannot be "
-                "computed here; results on a test set without it are scored on the benchmark's site"
-            )
+    check_ground_truth(dataset, {target.scene_id for target in asked})
     targets = dataset.localization_targets(asked)
     if not targets:
         raise BopError(
             f"there is nothing to localise: no targets (those of the dataset: {dataset.targets_path})"
         )
+    return tabulate(dataset, results, targets)
+
+
+def check_ground_truth(dataset: BopDataset, scenes: Iterable[int]) -> None:
+    """Raise BopError unless scenes have annotations."""
+    for scene_id in sorted(set(scenes)):
+        if not dataset.has_ground_truth(scene_id):
+            raise BopError(
+                f"scene {scene_id} of {dataset.split} has no ground truth (scene_gt.json), so scores cannot be "
+                "computed here; results on a test set without it are scored on the benchmark's site"
+            )
+
+
+def tabulate(
+    dataset: BopDataset, results: Sequence[PoseResult], targets: Sequence[Target], all_estimates: bool = False
+) -> Localization:
+    """Sort estimates and ground truth by target; all of a target's estimates, or so many as it has instances."""
     keys = [(t.scene_id, t.im_id, t.obj_id) for t in targets]
     number = {key: n for n, key in enumerate(keys)}
     images = sorted({key[:2] for key in keys})
@@ -97,7 +111,8 @@ def localization(
                 visibility.append(1.0 if visible is None else visible)
     for n, target in enumerate(targets):
         count = target.inst_count
-        estimates[n] = [estimates[n][i] for i in best([results[r].score for r in estimates[n]], count)]
+        kept = best([results[r].score for r in estimates[n]], None if all_estimates else count)
+        estimates[n] = [estimates[n][i] for i in kept]
         # In the order given, which decides between equal errors.
         annotations[n] = [
             annotations[n][i] for i in sorted(best([visibility[a] for a in annotations[n]], count))
@@ -112,6 +127,7 @@ def localization(
         annotations=_padded(annotations),
         T_est=_stacked([result.T_camera_from_model for result in results]),
         T_true=_stacked(poses),
+        visibility=torch.tensor(visibility, dtype=torch.float64),
         outside=outside,
     )
 

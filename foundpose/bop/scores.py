@@ -1,6 +1,6 @@
 """Recalls of an evaluation, as JSON and as a table."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -122,20 +122,26 @@ class Scores:
         total = sum(self.targets.values())
         for obj_id, count in [*self.targets.items(), (None, total)]:
             row = {"object": "all" if obj_id is None else str(obj_id), "targets": str(count)}
-            row |= {title: _percent(self.average_recall(name, obj_id)) for title, name in columns.items()}
-            row["AR"] = _percent(self.overall(obj_id))
+            row |= {title: percent(self.average_recall(name, obj_id)) for title, name in columns.items()}
+            row["AR"] = percent(self.overall(obj_id))
             if "add_s" in self.functions:
                 scores = self.functions["add_s"]
                 recalls = (scores.total if obj_id is None else scores.objects[obj_id]).recalls
                 # The usual figure: errors below a tenth of the diameter.
-                row["ADD(-S) 0.1d"] = _percent(None if recalls is None else float(recalls[-1]))
+                row["ADD(-S) 0.1d"] = percent(None if recalls is None else float(recalls[-1]))
             rows.append(row)
-        widths = {title: max(len(title), *(len(row[title]) for row in rows)) for title in rows[0]}
-        lines = ["  ".join(title.rjust(width) for title, width in widths.items())]
-        lines += ["  ".join(row[title].rjust(width) for title, width in widths.items()) for row in rows]
-        lines.insert(-1, "-" * len(lines[0]))
-        return "\n".join(lines)
+        return text_table(rows)
 
 
-def _percent(share: float | None) -> str:
+def text_table(rows: Sequence[Mapping[str, str]]) -> str:
+    """Rows as aligned text under their keys, the last below a line."""
+    widths = {title: max(len(title), *(len(row[title]) for row in rows)) for title in rows[0]}
+    lines = ["  ".join(title.rjust(width) for title, width in widths.items())]
+    lines += ["  ".join(row[title].rjust(width) for title, width in widths.items()) for row in rows]
+    lines.insert(-1, "-" * len(lines[0]))
+    return "\n".join(lines)
+
+
+def percent(share: float | None) -> str:
+    """A share in percent with one decimal; a dash for None."""
     return "–" if share is None else f"{100 * share:.1f}"

@@ -54,7 +54,7 @@ def score_results(
     annotations; an error counts as correct if it is below the threshold. A recall is the share of all instances,
     of whatever object, that were found; AR is its mean over the thresholds. Targets without estimate count as
     missed, estimates outside the targets are ignored. Targets of bop24 are turned into such of localisation, see
-    :meth:`BopDataset.localization_targets`.
+    :meth:`BopDataset.localization_targets`; their own score is :func:`~foundpose.bop.score_pose_detections`.
 
     Args:
         dataset: the dataset, with ground truth and the models for evaluation.
@@ -278,7 +278,7 @@ def _facts(dataset: BopDataset, tables: Localization, results: Sequence[PoseResu
     }
     if any(target.obj_id is None for target in dataset.targets()):
         facts["task"] = (
-            "localization recall on targets derived from the ground truth; the AP of 6D detection is not computed"
+            "localization recall on targets derived from the ground truth; detection_6d has the AP of 6D detection"
         )
     return facts
 

@@ -61,13 +61,19 @@ def describe_target(scene_id: int, im_id: int, obj_id: int | None = None) -> str
     return text if obj_id is None else f"object {obj_id} in {text}"
 
 
-def count_visible(scene_id: int, im_id: int, annotations: Iterable[tuple[int, float | None]]) -> list[Target]:
+def count_visible(
+    scene_id: int,
+    im_id: int,
+    annotations: Iterable[tuple[int, float | None]],
+    at_least: float = MIN_VISIBLE_FRACTION,
+) -> list[Target]:
     """Localisation targets of one image, by object: its instances of which at least a tenth is visible.
 
     Args:
         scene_id: the scene.
         im_id: the image.
         annotations: (object, visible fraction) of each annotated instance.
+        at_least: visible fraction from which an instance counts.
 
     Raises:
         BopError: a visible fraction is not known.
@@ -79,5 +85,5 @@ def count_visible(scene_id: int, im_id: int, annotations: Iterable[tuple[int, fl
                 f"the visible fraction of {describe_target(scene_id, im_id, obj_id)} is not known: "
                 "scene_gt_info.json with visib_fract is needed to tell which instances count"
             )
-        counts[obj_id] += visible >= MIN_VISIBLE_FRACTION
+        counts[obj_id] += visible >= at_least
     return [Target(scene_id, im_id, obj_id, n) for obj_id, n in sorted(counts.items()) if n]

@@ -17,8 +17,10 @@ from foundpose.bop import (
     best_of_targets,
     check_functions,
     check_times,
+    detection_scores,
     read_results,
     result_file_name,
+    score_pose_detections,
     score_results,
     write_results,
 )
@@ -35,14 +37,14 @@ from foundpose.utils.progress import ProgressBars
 def run_evaluation(cfg: DictConfig, output: Path) -> Scores | None:
     """Estimate what is not estimated yet, then write results, scores and times to the run's folder.
 
-    With ``cfg.results`` the poses of that file are scored instead.
+    With ``cfg.results`` the poses of that file are scored instead; with ``cfg.detections`` its 2D detections.
 
     Args:
         cfg: as ``conf/evaluate.yaml``.
         output: the run's folder; in a run of several processes each gets it, and the first writes the results.
 
     Returns:
-        The scores; None in all processes but the first, and for a split without ground truth.
+        The scores of poses; None in all processes but the first, and for a split without ground truth.
 
     Raises:
         ValueError: settings or files that make no sense; the message says which.
@@ -51,6 +53,9 @@ def run_evaluation(cfg: DictConfig, output: Path) -> Scores | None:
     check_functions(list(cfg.errors))
     dataset: BopDataset = instantiate(cfg.data)
     wanted = wanted_objects(cfg, dataset)
+    if cfg.detections is not None:
+        _score_detections(cfg, dataset, wanted, output)
+        return None
     records = None
     if cfg.results is not None:
         results = read_results(cfg.results)
@@ -139,10 +144,26 @@ def _score(
         progress=ProgressBars("score"),
     )
     missing = unanswered(targets, results, records)
-    write_json(output / "scores.json", scores.to_json() | {"without_estimate": missing})
+    content = scores.to_json() | {"without_estimate": missing}
     print(scores.table())
+    if any(target.obj_id is None for target in dataset.targets()):
+        precision = score_pose_detections(
+            dataset, results, dataset.images()[: cfg.max_images], wanted, progress=ProgressBars("score")
+        )
+        content["detection_6d"] = precision.to_json()
+        print(f"6D detection:\n{precision.table()}")
+    write_json(output / "scores.json", content)
     print(in_words(missing))
     return scores
+
+
+def _score_detections(cfg: DictConfig, dataset: BopDataset, wanted: list[int], output: Path) -> None:
+    """Write detection_scores.json and print the table."""
+    scores = detection_scores(
+        dataset, cfg.detections, images=dataset.images()[: cfg.max_images], object_ids=wanted
+    )
+    write_json(output / "detection_scores.json", scores.to_json())
+    print(scores.table())
 
 
 def _targets(cfg: DictConfig, targets: list[Target], dataset: BopDataset, wanted: list[int]) -> list[Target]:

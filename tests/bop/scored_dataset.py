@@ -11,7 +11,7 @@ from PIL import Image
 
 from foundpose.bop.results import PoseResult
 from foundpose.geometry import se3_exp
-from foundpose.rendering import RaycastRenderer, load_mesh
+from foundpose.rendering import Mesh, RaycastRenderer, load_mesh
 
 HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
 """Symmetry of object 1 about its z axis."""
@@ -147,6 +147,17 @@ def _greedy(errors, annotations, threshold):
         if best is not None and row[best] < threshold:
             free.remove(best)
     return annotations - len(free)
+
+
+def plain_errors(dataset, result, annotation):
+    """MSSD in diameters and MSPD scaled, of one estimate and one annotation."""
+    image = (result.scene_id, result.im_id)
+    box = trimesh.creation.box(BOXES[result.obj_id])
+    mesh = Mesh(torch.from_numpy(np.array(box.vertices)), torch.from_numpy(np.array(box.faces)))
+    est, true = result.T_camera_from_model.numpy(), annotation.T_camera_from_model.numpy()
+    mssd, mspd = _pair(mesh, result.obj_id, est, true, dataset.intrinsics(*image).numpy())
+    diameter = float(np.linalg.norm(BOXES[result.obj_id]))
+    return {"mssd": mssd / diameter, "mspd": mspd * 640 / dataset.image_size(*image)[1]}
 
 
 def _pair(mesh, obj_id, est, true, K):

@@ -208,7 +208,25 @@ def test_targets_that_name_images_only(arguments, root, reference, tmp_path, mon
     scores = json.loads((output / "scores.json").read_text())
     assert scores["targets"] == NUM_IMAGES
     assert "6D detection" in scores["task"]
+    detection = scores["detection_6d"]
+    # The made-up detections beside the true ones find no pose.
+    assert (detection["targets"], detection["estimates_counted"]) == (NUM_IMAGES, NUM_IMAGES)
+    assert detection["objects"]["1"]["AP_MSPD"] == pytest.approx(scores["objects"]["1"]["AR_MSPD"], abs=0.01)
     assert scores["mspd"]["AR"] == json.loads((reference / "scores.json").read_text())["mspd"]["AR"]
+
+
+def test_two_dimensional_detections(root, tmp_path, monkeypatch, capsys):
+    """The made-up file holds the visible masks, empty ones of lower score, and boxes of one pixel."""
+    changes = [
+        f"data.root={root}",
+        f"detections={root / 'detections' / 'cnos-fastsam'}",
+        f"hydra.run.dir={tmp_path}",
+    ]
+    run_app(monkeypatch, "evaluate", *changes)
+    scores = json.loads((tmp_path / "detection_scores.json").read_text())
+    assert scores["targets"] == NUM_IMAGES
+    assert "AP_segm  AP_bbox  AP_bbox_modal" in capsys.readouterr().out
+    assert (scores["segm"]["AP"], scores["bbox"]["AP"]) == (pytest.approx(1.0), 0.0)
 
 
 @pytest.mark.parametrize(
