@@ -37,6 +37,7 @@ MAY_CHANGE = (
     "folder",
     "report_only",
     "overlays",
+    "report",
     "data_module.num_workers",
     "data_module.prepare_data_per_node",
 )

@@ -46,7 +46,14 @@ def cache_pairs(folder, _):
 
 
 def evaluate(folder, root):
-    _app("evaluate", root, "data_module.batch_size=1", f"hydra.run.dir={folder / 'run'}", *_stores(folder))
+    _app(
+        "evaluate",
+        root,
+        "report=null",
+        "data_module.batch_size=1",
+        f"hydra.run.dir={folder / 'run'}",
+        *_stores(folder),
+    )
 
 
 def ablate(folder, root):

@@ -25,7 +25,16 @@ from foundpose.utils.files import write_text
 from foundpose.utils.settings import digest
 
 # Keys that say where things lie and what they are called, not what is computed.
-_NOT_SETTINGS = ("folder", "representations", "artefacts", "results", "method", "row", "report_only")
+_NOT_SETTINGS = (
+    "folder",
+    "representations",
+    "artefacts",
+    "results",
+    "method",
+    "row",
+    "report",
+    "report_only",
+)
 # What may be overridden in an experiment that is a row of the paper: it stays that row.
 _ROW_MAY_CHANGE = (
     *_NOT_SETTINGS,

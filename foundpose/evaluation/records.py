@@ -1,12 +1,14 @@
 """Estimates as plain records: what is written to JSON and to BOP's results file."""
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from foundpose.bop import Instance, PoseResult
+from foundpose.geometry import make_transform
 from foundpose.pipeline.results import PoseEstimates, PoseStatus
 
 
@@ -87,9 +89,12 @@ def to_results(records: Sequence[dict[str, Any]]) -> list[PoseResult]:
     results = []
     for record in records:
         if record["valid"]:
-            T = torch.eye(4, dtype=torch.float64)
-            T[:3, :3] = torch.tensor(record["R"], dtype=torch.float64)
-            T[:3, 3] = torch.tensor(record["t"], dtype=torch.float64)
             ids = (record["scene_id"], record["im_id"], record["obj_id"])
-            results.append(PoseResult(*ids, record["score"], T, record["time"]))
+            results.append(PoseResult(*ids, record["score"], pose_of(record), record["time"]))
     return results
+
+
+def pose_of(record: Mapping[str, Any]) -> Tensor:
+    """``T_camera_from_model`` (4, 4) float64 of a record."""
+    R, t = (torch.tensor(record[name], dtype=torch.float64) for name in ("R", "t"))
+    return make_transform(R, t)

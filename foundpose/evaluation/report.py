@@ -2,17 +2,42 @@
 
 import platform
 from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
+from torch import Tensor
 
-from foundpose.bop import Instance, PoseResult, Target
+from foundpose.bop import BopDataset, Instance, PoseResult, Target
 from foundpose.bop.targets import describe_target
+from foundpose.evaluation.objects import DatasetObjects
 from foundpose.evaluation.records import add_image_times
 from foundpose.evaluation.shards import BatchRecord, read_shards
+from foundpose.pipeline import FoundPose
 from foundpose.pipeline.results import PoseStatus
+
+
+class Estimated(NamedTuple):
+    """What an evaluation estimated.
+
+    Attributes:
+        dataset: the dataset.
+        pictures: makes the picture of an image.
+        objects: meshes and representations.
+        pipeline: the method.
+        device: where it computes.
+        instances: the masks, one for each record.
+        records: the estimates.
+    """
+
+    dataset: BopDataset
+    pictures: Callable[[BopDataset, int, int], Tensor]
+    objects: DatasetObjects
+    pipeline: FoundPose
+    device: torch.device
+    instances: Sequence[Instance]
+    records: list[dict[str, Any]]
 
 
 def merge_shards(folder: Path, batches: Sequence[Sequence[Instance]]) -> list[BatchRecord]:

@@ -29,7 +29,7 @@ from foundpose.evaluation.data import PoseDataModule
 from foundpose.evaluation.module import PoseEvaluation, estimate_dataset
 from foundpose.evaluation.objects import DatasetObjects
 from foundpose.evaluation.records import to_results
-from foundpose.evaluation.report import all_records, in_words, merge_shards, timing, unanswered
+from foundpose.evaluation.report import Estimated, all_records, in_words, merge_shards, timing, unanswered
 from foundpose.utils.files import write_json
 from foundpose.utils.progress import ProgressBars
 
@@ -56,25 +56,29 @@ def run_evaluation(cfg: DictConfig, output: Path) -> Scores | None:
     if cfg.detections is not None:
         _score_detections(cfg, dataset, wanted, output)
         return None
-    records = None
+    estimated = records = None
     if cfg.results is not None:
         results = read_results(cfg.results)
         check_times(results)
     else:
-        records = _estimate(cfg, dataset, wanted, output)
-        if records is None:
+        report = None if cfg.report is None else instantiate(cfg.report)
+        estimated = _estimate(cfg, dataset, wanted, output)
+        if estimated is None:
             return None
+        records = estimated.records
         results = best_of_targets(to_results(records), dataset.targets())
         path = output / result_file_name(cfg.method, dataset.name, cfg.data.split)
         write_results(path, results)
         print(f"{len(records)} instances, {sum(r['valid'] for r in records)} with a pose; written to {path}")
-    return _score(cfg, dataset, results, records, wanted, output)
+    scores = _score(cfg, dataset, results, records, wanted, output)
+    if estimated is not None and report is not None:
+        report(output / "report.html", estimated, scores)
+        print(f"report: {output / 'report.html'}")
+    return scores
 
 
-def _estimate(
-    cfg: DictConfig, dataset: BopDataset, wanted: list[int], output: Path
-) -> list[dict[str, Any]] | None:
-    """Records of all instances, in the first process; None in the others."""
+def _estimate(cfg: DictConfig, dataset: BopDataset, wanted: list[int], output: Path) -> Estimated | None:
+    """The estimates of all instances, in the first process; None in the others."""
     masks = instantiate(cfg.masks)
     method = build_method(cfg)
     objects = DatasetObjects(dataset, method.store, cfg.memory_limit, color=cfg.color)
@@ -108,7 +112,10 @@ def _estimate(
     write_json(output / "memory.json", memory(objects, sorted({i.obj_id for i in found})))
     records = all_records(done)
     write_json(output / "estimates.json", records)
-    return records
+    # In the order of the records.
+    instances = sorted(found, key=lambda i: (i.scene_id, i.im_id, i.obj_id))
+    device = trainer.strategy.root_device
+    return Estimated(dataset, data.pictures, objects, method.pipeline, device, instances, records)
 
 
 def memory(objects: DatasetObjects, ids: list[int]) -> dict[str, dict[str, int]]:

@@ -1,6 +1,7 @@
 import csv
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -39,6 +40,7 @@ def arguments(root, representations):
         f"representations={representations}",
         "trainer.accelerator=cpu",
         "data_module.batch_size=2",
+        "report=null",
     ]
 
 
@@ -46,7 +48,8 @@ def arguments(root, representations):
 def reference(arguments, tmp_path_factory):
     """A run left alone, of one process."""
     folder = tmp_path_factory.mktemp("reference")
-    run_app_on_one_thread("evaluate", *arguments, f"hydra.run.dir={folder}")
+    wanted = [argument for argument in arguments if argument != "report=null"]
+    run_app_on_one_thread("evaluate", *wanted, "report.figures=2", f"hydra.run.dir={folder}")
     return folder
 
 
@@ -70,6 +73,20 @@ def start(arguments, folder):
 
 def rows_without_times(path):
     return [line.split(",")[:-1] for line in path.read_text().splitlines()]
+
+
+def test_the_report_has_every_instance_and_a_figure_of_the_worst(reference):
+    page = (reference / "report.html").read_text(encoding="utf-8")
+    found = re.search(r'<script id="data" type="application/json">(.*?)</script>', page, re.DOTALL)
+    assert found is not None
+    cases = json.loads(found[1])
+    assert len(cases["rows"]) == len(cases["thumbnails"]) == NUM_IMAGES
+    assert set(cases["figures"]) == {"0", "1"}
+    assert {row["reason"] for row in cases["rows"]} == {"right"}
+    errors = [row["MSPD / px"] for row in cases["rows"]]
+    assert errors == sorted(errors, reverse=True)
+    assert all(row["mask's overlap"] == 1 for row in cases["rows"])
+    assert "Recall under MSSD" in page
 
 
 def test_a_run_from_detections_to_scores(reference):
