@@ -15,6 +15,7 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
 from ablation.memory import memory_table
+from ablation.page import write_runs_page
 from ablation.plots import plot_sweep
 from ablation.records import RUN_FILE, RunRecord, collect_runs, varied_settings, write_tidy
 from ablation.sweeps import SWEEP_FIGURES, sweep_table
@@ -185,7 +186,7 @@ def _figures(folder: Path) -> dict[str, Any]:
 
 
 def write_reports(folder: str | Path) -> list[RunRecord]:
-    """Write results.csv, the paper's tables, and a table and plots of every setting that was varied on its own.
+    """Write results.csv, report.html, the paper's tables, and tables and plots of the settings that were varied.
 
     Args:
         folder: ``folder`` of ``conf/ablate.yaml``; ``runs`` in it is read, ``tables`` and ``plots`` are written.
@@ -198,6 +199,7 @@ def write_reports(folder: str | Path) -> list[RunRecord]:
     if not records:
         return records
     write_tidy(records, folder / "results.csv")
+    write_runs_page(records, folder / "report.html")
     tables: dict[str, str] = {}
     for suffix, format in _FORMATS:
         for number in (1, 2):
