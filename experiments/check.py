@@ -4,7 +4,6 @@ python experiments/check.py image=photo.jpg mesh=cup.ply mask=mask.png intrinsic
 """
 
 import math
-import sys
 import warnings
 from pathlib import Path
 
@@ -33,8 +32,7 @@ GOOD, POOR = 0.8, 0.65
 @hydra.main(version_base="1.3", config_path="../conf", config_name="check")
 def main(cfg: DictConfig) -> None:
     """Print a line for each file, and write a picture to the run's folder."""
-    with clear_errors(), warnings.catch_warnings():
-        warnings.showwarning = _show_warning
+    with clear_errors():
         check(cfg, Path(HydraConfig.get().runtime.output_dir))
 
 
@@ -158,10 +156,6 @@ def draw(image: Tensor, mask: Tensor, K: Tensor, mesh: Mesh, fit: SilhouetteFit,
     side = torch.cat(list(close), dim=1)
     whole = F.interpolate(drawn[None], scale_factor=480 / size[0], mode="area")[0][:, :480]
     return to_pil(torch.cat([F.pad(whole, (0, 0, 0, 480 - whole.shape[1])), side], dim=2))
-
-
-def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
-    print(f"warning    {message}", file=sys.stderr)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,6 @@ from hydra.utils import instantiate
 from matplotlib.figure import Figure
 from omegaconf import DictConfig
 from torch import Tensor
-from tqdm import tqdm
 
 from foundpose.bop import BopDataset, Instance, ground_truth_instances
 from foundpose.config import build_method, clear_errors, wanted_objects
@@ -29,7 +28,7 @@ from foundpose.refinement import Observation, PoseProposals
 from foundpose.rendering import load_mesh
 from foundpose.representation import ObjectGroups
 from foundpose.utils.files import write_atomically, write_json
-from foundpose.utils.progress import ProgressBars
+from foundpose.utils.progress import ProgressBars, track
 
 
 @hydra.main(version_base="1.3", config_path="../conf", config_name="convergence")
@@ -57,7 +56,7 @@ def run(cfg: DictConfig, output: Path) -> None:
         name: [] for name in ("coarse", "coarse, refined", "perturbed", "perturbed, refined")
     }
     instances = list(visible_instances(cfg, dataset, set(objects)))
-    for instance, T_true in tqdm(instances, desc="instances"):
+    for instance, T_true in track(instances, "instances"):
         mesh, representation = objects[instance.obj_id]
         diameter = float(mesh.diameter)
         image = pictures(dataset, instance.scene_id, instance.im_id)[None].to(cfg.device)

@@ -19,7 +19,7 @@ from foundpose.geometry import pose_deviation
 from foundpose.pipeline.results import PoseEstimates
 from foundpose.representation import ObjectRepresentation
 from foundpose.utils.files import write_atomically
-from foundpose.utils.progress import ProgressBars
+from foundpose.utils.progress import ProgressBars, say
 from scenes import KnownScene
 
 
@@ -93,11 +93,6 @@ def errors(T_camera_from_model: Tensor, scene: KnownScene) -> tuple[float, float
     """Rotation error in degrees and translation error in the mesh's unit."""
     deviation = pose_deviation(T_camera_from_model.cpu(), scene.T_camera_from_model)
     return float(deviation.rotation), float(deviation.translation)
-
-
-def say(step: str) -> None:
-    """Print a step at once, also where the output is a pipe."""
-    print(step, flush=True)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,6 @@ from hydra.utils import instantiate
 from kornia.geometry.calibration import undistort_image
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
-from tqdm import tqdm
 
 from foundpose.bop import (
     BopDataset,
@@ -42,8 +41,9 @@ from foundpose.pipeline.results import PoseEstimates
 from foundpose.rendering import Mesh, load_mesh
 from foundpose.representation import ObjectRepresentation
 from foundpose.utils.files import write_atomically, write_json
-from foundpose.utils.progress import ProgressBars
+from foundpose.utils.progress import ProgressBars, say, track
 from foundpose.utils.timing import StageTimer
+from foundpose.visualization.scene import write_scene
 
 
 @hydra.main(version_base="1.3", config_path="../conf", config_name="estimate")
@@ -75,10 +75,12 @@ def estimate_picture(cfg: DictConfig, output: Path) -> None:
     write_json(output / "estimate.json", facts)
     write_results(output / "results.csv", to_results([facts | {"scene_id": 0, "im_id": 0, "obj_id": 0}]))
     write_atomically(output / "overlay.png", estimates.draw(0).save)
+    if facts["valid"]:
+        write_scene(output / "scene.glb", image, K, [(mesh, estimates.T_camera_from_model[0])])
     print(json.dumps(facts, indent=1))
     print(f"written to {output}")
     if not facts["valid"]:
-        print(f"no pose was found: {facts['status']}", file=sys.stderr)
+        say(f"no pose was found: {facts['status']}")
         sys.exit(1)
 
 
@@ -166,7 +168,7 @@ def estimate_dataset(cfg: DictConfig, output: Path) -> None:
     objects.onboard(sorted({i.obj_id for key in images for i in by_image[key]}), ProgressBars)
 
     entries: list[dict[str, Any]] = []
-    for position, (scene_id, im_id) in enumerate(tqdm(images, desc="images")):
+    for position, (scene_id, im_id) in enumerate(track(images, "images")):
         path = output / "images" / f"{scene_id:06d}_{im_id:06d}.json"
         if not path.is_file():
             members = by_image[scene_id, im_id]

@@ -29,7 +29,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter, NullLocator
 from omegaconf import DictConfig, OmegaConf
-from tqdm import tqdm
 
 from ablation.plots import decorate, save_figure
 from benchmarking import ScriptedExtractor, Workload, WorkloadSizes, make_workload
@@ -40,6 +39,7 @@ from foundpose.config import clear_errors
 from foundpose.representation import ObjectRepresentation
 from foundpose.representation.quantization import Storage
 from foundpose.utils.files import write_json, write_text
+from foundpose.utils.progress import track
 
 _MIB = 2**20
 _GIB = 2**30
@@ -167,7 +167,7 @@ def measure(cfg: DictConfig, files: Path) -> list[Row]:
             fitting = [count for count in counts if count <= len(paths)]
             measured = [
                 measure_objects(name, paths[:count], crops, cfg.crops)
-                for count in tqdm(fitting, desc=f"{name}: numbers of objects")
+                for count in track(fitting, f"{name}: numbers of objects")
             ]
         rows += measured + [measured[-1].at(count, cfg.crops) for count in counts if count not in fitting]
     return rows
@@ -203,7 +203,7 @@ def distinct_files(
                 f"{counts[0]} objects of {size / _MIB:.0f} MiB do not fit in {room / _GIB:.1f} GiB (disk_limit, or "
                 f"half of what is free in {folder})"
             )
-        for i in tqdm(range(1, fitting[-1]), desc=f"{name}: files", initial=1, total=fitting[-1]):
+        for i in track(range(1, fitting[-1]), f"{name}: files"):
             paths.append(folder / f"object_{i:06d}.safetensors")
             shutil.copyfile(first, paths[-1])
         yield paths

@@ -21,7 +21,6 @@ from omegaconf import DictConfig, OmegaConf
 from pytorch_lightning.callbacks import ModelCheckpoint
 from pytorch_lightning.loggers import CSVLogger
 from safetensors.torch import load_file, save_file
-from tqdm import tqdm
 
 from foundpose.bop.files import parse_models_info, read_json
 from foundpose.config import build_method, claim_run_folder, clear_errors
@@ -39,7 +38,8 @@ from foundpose.training import (
 )
 from foundpose.training.meshes import meshes_to_train_on, small_mesh
 from foundpose.utils.files import write_atomically, write_json, write_text
-from foundpose.utils.progress import ProgressBars
+from foundpose.utils.lightning import LightningProgress
+from foundpose.utils.progress import ProgressBars, track
 
 # Procedural objects are numbered from here; scenes of the held-out object are like no scene trained on.
 TRAINING_OBJECTS, VALIDATION_OBJECTS, HELD_OUT_SCENES = 1000, 2000, 10_000
@@ -183,7 +183,7 @@ def measure(
         method.pipeline,
         representation,
         mesh,
-        tqdm(scenes, f"{title} scenes", cfg.scenes),
+        track(scenes, f"{title} scenes", cfg.scenes),
         symmetries=symmetries,
     )
     flat = {f"{mode}.{field}": value for mode in MODES for field, value in errors[mode]._asdict().items()}
@@ -218,7 +218,10 @@ def train(
     module: AdapterTraining = instantiate(cfg.training, adapter=adapter)
     checkpoint = ModelCheckpoint(dirpath=output / "checkpoints", save_last=True)
     trainer: pl.Trainer = instantiate(
-        cfg.trainer, default_root_dir=output, logger=CSVLogger(output, name="log"), callbacks=[checkpoint]
+        cfg.trainer,
+        default_root_dir=output,
+        logger=CSVLogger(output, name="log"),
+        callbacks=[checkpoint, LightningProgress()],
     )
     last = output / "checkpoints" / "last.ckpt"
     trainer.fit(module, datamodule=data, ckpt_path=str(last) if last.is_file() else None)

@@ -33,6 +33,7 @@ from foundpose.training import (
 )
 from foundpose.training.meshes import meshes_to_train_on, small_mesh
 from foundpose.utils.files import write_atomically, write_json
+from foundpose.utils.lightning import LightningProgress
 from foundpose.utils.progress import ProgressBars
 
 # Procedural objects are numbered from here; pictures of the held-out object are like none trained on.
@@ -108,7 +109,10 @@ def train(
     module: RefinerTraining = instantiate(cfg.training, refiner=refiner)
     checkpoint = ModelCheckpoint(dirpath=output / "checkpoints", save_last=True)
     trainer: pl.Trainer = instantiate(
-        cfg.trainer, default_root_dir=output, logger=CSVLogger(output, name="log"), callbacks=[checkpoint]
+        cfg.trainer,
+        default_root_dir=output,
+        logger=CSVLogger(output, name="log"),
+        callbacks=[checkpoint, LightningProgress()],
     )
     last = output / "checkpoints" / "last.ckpt"
     trainer.fit(module, datamodule=data, ckpt_path=str(last) if last.is_file() else None)

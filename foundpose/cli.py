@@ -10,6 +10,10 @@ from pathlib import Path
 from foundpose.config import apps_folder
 
 HIDDEN = {"scenes"}  # modules beside the apps
+EXTRAS = {  # what an installation may lack, and the extra that brings it
+    **dict.fromkeys(("pytorch_lightning", "pandas", "plotly", "jinja2", "matplotlib"), "evaluate"),
+    **dict.fromkeys(("cv2", "faiss", "sklearn"), "benchmark"),
+}
 
 
 def main() -> None:
@@ -26,7 +30,13 @@ def main() -> None:
         script = scripts[arguments[0]]
         sys.argv = [str(script), *arguments[1:]]
         sys.path.insert(0, str(script.parent))
-        runpy.run_path(str(script), run_name="__main__")
+        try:
+            runpy.run_path(str(script), run_name="__main__")
+        except ModuleNotFoundError as error:
+            if error.name not in EXTRAS:
+                raise
+            print(f"error: {error}: pip install 'foundpose[{EXTRAS[error.name]}]'", file=sys.stderr)
+            sys.exit(2)
     else:
         print(
             f"error: no command {arguments[0]!r}; there are {', '.join([*scripts, 'info'])}", file=sys.stderr
@@ -57,8 +67,22 @@ def info() -> str:
 
     from foundpose.features.wheel import cache_folder
 
-    packages = ("foundpose", "torch", "kornia", "transformers", "trimesh", "pyrender", "pytorch-lightning")
-    facts = {name: importlib.metadata.version(name) for name in packages}
+    packages = (
+        "foundpose",
+        "torch",
+        "kornia",
+        "transformers",
+        "trimesh",
+        "pyrender",
+        "pytorch-lightning",
+        "matplotlib",
+    )
+    facts = {}
+    for name in packages:
+        try:
+            facts[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            facts[name] = "not installed"
     facts["python"] = sys.version.split()[0]
     gpus = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
     facts["GPUs"] = ", ".join(gpus) or "none that PyTorch sees"

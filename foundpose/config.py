@@ -6,6 +6,7 @@ import os
 import sys
 import sysconfig
 import traceback
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,6 +15,7 @@ from typing import Any, NamedTuple
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.errors import InstantiationException
+from hydra.experimental.callback import Callback
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
@@ -23,6 +25,7 @@ from foundpose.onboarding import ArtefactStore, Onboarder, RepresentationStore
 from foundpose.pipeline import FoundPose
 from foundpose.rendering import RendererNotAvailableError
 from foundpose.utils.files import write_text
+from foundpose.utils.progress import say
 
 # Settings that may change when a run is resumed: they change no pose, or say where things lie and are called.
 MAY_CHANGE = (
@@ -37,6 +40,7 @@ MAY_CHANGE = (
     "folder",
     "report_only",
     "overlays",
+    "progress",
     "report",
     "data_module.num_workers",
     "data_module.prepare_data_per_node",
@@ -160,15 +164,27 @@ def claim_run_folder(folder: Path, cfg: DictConfig, may_change: tuple[str, ...] 
     write_text(path, text)
 
 
+class SetProgress(Callback):
+    """Lets an app's key ``progress`` hold for all bars, in the processes that it starts too."""
+
+    def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Before the app's own code."""
+        os.environ["FOUNDPOSE_PROGRESS"] = str(config.progress).lower()
+
+
 @contextmanager
 def clear_errors() -> Iterator[None]:
-    """Turn bad input into a line on standard error and exit status 2; HYDRA_FULL_ERROR=1 shows where it arose.
+    """Turn bad input into a line on standard error and exit status 2, and warnings into a line each.
+
+    HYDRA_FULL_ERROR=1 shows where an error arose.
 
     Bad input is what this library or an app refuses, and files that the system does not let be read or written. A
     ``ValueError`` from elsewhere is a mistake in a program, and goes on with its traceback.
     """
     try:
-        yield
+        with warnings.catch_warnings():
+            warnings.showwarning = lambda message, *_, **__: say(f"warning: {message}")
+            yield
     except (ValueError, OSError, RendererNotAvailableError, InstantiationException) as error:
         # Hydra wraps what a constructor raises.
         wrapped = isinstance(error, InstantiationException) and error.__cause__ is not None
@@ -176,7 +192,7 @@ def clear_errors() -> Iterator[None]:
         assert cause is not None
         if os.environ.get("HYDRA_FULL_ERROR") == "1" or not _is_refusal(cause):
             raise
-        print(f"error: {cause} (HYDRA_FULL_ERROR=1 shows where)", file=sys.stderr)
+        say(f"error: {cause} (HYDRA_FULL_ERROR=1 shows where)")
         sys.exit(2)
 
 

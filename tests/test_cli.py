@@ -66,3 +66,28 @@ def test_load_composes_the_default_with_overrides() -> None:
     assert type(method.pipeline.extractor).__name__ == "DenseSift"
     assert type(method.pipeline.refiner).__name__ == "FeaturemetricRefiner"
     assert method.onboarder.extractor is method.pipeline.extractor
+
+
+def test_the_base_installation_is_enough_for_what_needs_no_extra(tmp_path: Path) -> None:
+    code = (
+        "import runpy, sys\n"
+        "class Lacking:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name.partition('.')[0] in LACKING:\n"
+        "            raise ModuleNotFoundError(f'No module named {name!r}', name=name)\n"
+        f"LACKING = {[*cli.EXTRAS, 'pyrender']!r}\n"
+        "sys.meta_path.insert(0, Lacking())\n"
+        "from foundpose import cli\n"
+        "sys.path.insert(0, str(cli.apps()['demo'].parent))\n"
+        "for name in ('demo', 'estimate', 'onboard', 'check', 'view'):\n"
+        "    runpy.run_path(str(cli.apps()[name]), run_name='imported')\n"
+        "print('imported')\n"
+        "sys.argv = ['foundpose', 'evaluate']\n"
+        "cli.main()\n"
+    )
+    ran = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=300
+    )
+    assert ran.stdout == "imported\n", ran.stderr
+    assert ran.returncode == 2
+    assert ran.stderr.splitlines()[-1].endswith("pip install 'foundpose[evaluate]'")

@@ -88,6 +88,11 @@ def test_every_option_is_instantiated(group, option, tiny_bop, monkeypatch):
         cfg = load("demo", f"scene={option}", "extractor=dense_sift", *(overrides if option == "bop" else []))
         assert instantiate(cfg.scene).mask.any()
         return
+    if group == "terminal":
+        cfg = load_with_hydra("check", "progress=false")
+        assert instantiate(cfg.hydra.callbacks.progress) is not None
+        assert cfg.hydra.job_logging.handlers.console.stream == "ext://sys.stderr"
+        return
     if group == "trainer":  # of an evaluation
         trainer = instantiate(load("evaluate", f"trainer={option}", "trainer.accelerator=cpu").trainer)
         assert isinstance(trainer.strategy, DDPStrategy) == (option == "ddp")
@@ -149,8 +154,8 @@ def test_the_default_is_the_papers_but_for_what_was_measured():
     assert cfg.retrieval.retriever.bow == cfg.onboarder.bow
 
 
-# check.yaml alone has no method.
-@pytest.mark.parametrize("name", sorted({path.stem for path in CONF.glob("*.yaml")} - {"check"}))
+# check.yaml and view.yaml have no method.
+@pytest.mark.parametrize("name", sorted({path.stem for path in CONF.glob("*.yaml")} - {"check", "view"}))
 def test_every_app_builds_its_method(name, tmp_path):
     cfg = load(
         name,

@@ -23,6 +23,7 @@ from ablation.tables import paper_table
 from ablation.text_tables import Format
 from foundpose.config import MAY_CHANGE
 from foundpose.utils.files import write_text
+from foundpose.utils.progress import say
 from foundpose.utils.settings import digest
 
 # Keys that say where things lie and what they are called, not what is computed.
@@ -35,6 +36,7 @@ _NOT_SETTINGS = (
     "row",
     "report",
     "report_only",
+    "progress",
 )
 # What may be overridden in an experiment that is a row of the paper: it stays that row.
 _ROW_MAY_CHANGE = (
@@ -108,12 +110,12 @@ def run_once(cfg: DictConfig, name: str | None = None, overrides: Sequence[str] 
     folder, settings = run_folder(cfg), run_settings(cfg)
     row = cfg.row if _is_still_the_row(overrides) else None
     if row != cfg.row:
-        print(f"not {cfg.row} any more, with {', '.join(overrides)}: recorded without it")
+        say(f"not {cfg.row} any more, with {', '.join(overrides)}: recorded without it")
     facts: dict[str, Any] = {"name": name, "row": row, "dataset": _dataset(cfg), "label": _label(settings)}
     if (folder / RUN_FILE).is_file():
         before = RunRecord.read(folder / RUN_FILE)
         if before.status == "finished" and before.settings.get("errors") == settings["errors"]:
-            print(f"already there: {folder}")
+            say(f"already there: {folder}")
             if before.row is None and row is not None:
                 before = replace(before, name=name, row=row)
                 before.write(folder)
@@ -133,7 +135,7 @@ def run_once(cfg: DictConfig, name: str | None = None, overrides: Sequence[str] 
         write_text(folder / "error.txt", text)
         cause = _root_cause(error)
         record = replace(started, error=f"{type(cause).__name__}: {cause}")
-        print(f"failed: {folder}: {record.error}", file=sys.stderr)
+        say(f"failed: {folder}: {record.error}")
     record.write(folder)
     return record
 
@@ -258,7 +260,7 @@ class SweepReport(Callback):
         failed = [record for record in records if record.status == "failed"]
         print(f"{len(records) - len(failed)} runs finished, {len(failed)} failed; see {config.folder}")
         for record in failed:
-            print(f"failed: {record.folder}: {record.error}", file=sys.stderr)
+            say(f"failed: {record.folder}: {record.error}")
         if failed:
             sys.exit(1)
 

@@ -124,6 +124,49 @@ class EvaluationReport:
         return drawn
 
 
+def write_pictures_report(
+    path: Path,
+    records: Sequence[Mapping[str, Any]],
+    thumbnails: Mapping[int, Image.Image],
+    figures: Mapping[int, Image.Image],
+) -> None:
+    """Write the report of pictures of one's own, of which no truth is known: no pose first, then the lowest scores.
+
+    Args:
+        path: of the HTML file.
+        records: as :func:`~foundpose.evaluation.records.pose_records` makes them, with ``image``, ``mesh`` and
+            ``time``.
+        thumbnails: small pictures, by place in ``records``.
+        figures: large ones (``estimates.draw(i)``), by place in ``records``.
+    """
+    order = sorted(range(len(records)), key=lambda k: (records[k]["valid"], records[k]["score"]))
+    cases: list[dict[str, Cell]] = [
+        {
+            "picture": Path(record["image"]).name,
+            "object": Path(record["mesh"]).stem,
+            "status": record["status"],
+            "score": record["score"],
+            "inliers": record["num_inliers"],
+            "patches": record["num_patches"],
+            "distance": record["t"][2] if record["valid"] else None,
+            "s": record["time"],
+        }
+        for record in (records[k] for k in order)
+    ]
+    found = sum(record["valid"] for record in records)
+    places = {place: rank for rank, place in enumerate(order)}
+    report = Report(
+        title=f"{len(records)} objects in {len({record['image'] for record in records})} pictures",
+        facts={"with a pose": str(found), "without": str(len(records) - found)},
+        tables={},
+        charts={},
+        cases=cases,
+        thumbnails={places[k]: picture for k, picture in thumbnails.items()},
+        figures={places[k]: picture for k, picture in figures.items()},
+    )
+    write_report(path, report)
+
+
 def thumbnail(
     image: Tensor, K: Tensor, mask: Tensor, view: ObjectView, poses: Sequence[tuple[Color, Tensor]]
 ) -> Image.Image:

@@ -16,7 +16,7 @@ from foundpose.rendering.shading import AMBIENT, Hits, Surface, surface_of
 _SHADERS = Path(__file__).parent / "shaders"
 _GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])
 _HELP = (
-    "PyrenderRenderer needs pyrender and a working EGL (on Debian and Ubuntu: "
+    "PyrenderRenderer needs pyrender (pip install 'foundpose[opengl]') and a working EGL (on Debian and Ubuntu: "
     "apt-get install libegl1 libgl1-mesa-dri). RaycastRenderer gives the same pictures and needs neither"
 )
 

@@ -166,7 +166,7 @@ def test_a_sweep_from_the_command_line(arguments, tmp_path):
     # Nothing that is finished is repeated, and nothing that is shared is made again.
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("*.safetensors")}
     again = sweep("projection.num_components=16,32", "pnp.iterations=400,50", "launcher=joblib")
-    assert again.stdout.count("already there") == 2, again.stderr[-2000:]
+    assert again.stderr.count("already there") == 2, again.stderr[-2000:]
     assert "4 runs finished, 1 failed" in again.stdout, again.stderr[-2000:]
     assert [r.status for r in collect_runs(folder / "runs") if r.settings["pnp.iterations"] == 50] == [
         *("finished", "finished")
