@@ -61,17 +61,16 @@ def se3_exp(twist: Tensor) -> Tensor:
     if twist.shape[-1] != 6:
         raise ValueError(f"twist must have shape (..., 6), got {tuple(twist.shape)}")
     # Written out, where kornia's So3 takes six times as many operations: optimisers call this in every step.
-    v, w = twist.split(3, dim=-1)
-    x, y, z = w.unbind(-1)
-    zero = torch.zeros_like(x)
-    hat = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
-    # The series of exp(X) ends: X⁴ = −θ² X² for a twist's matrix X, so I + X + B X² + C X³ is all of it.
-    X = torch.cat([hat, v.unsqueeze(-1)], dim=-1)
-    B, C = _exponential_coefficients(w.square().sum(-1, keepdim=True).unsqueeze(-1))
-    square = hat @ X
-    top = X + B * square + C * (hat @ square)
+    v, w = twist.unsqueeze(-1).split(3, dim=-2)
     identity = torch.eye(4, dtype=twist.dtype, device=twist.device)
-    return identity + F.pad(top, (0, 0, 0, 1))
+    # The series of exp(X) ends: X⁴ = −θ² X² for a twist's matrix X, so I + X + B X² + C X³ is all of it. The product
+    # of ω's skew-symmetric matrix with another is the cross product with its columns.
+    columns = identity[:3].expand(*twist.shape[:-1], 3, 4)
+    X = torch.linalg.cross(w, columns, dim=-2) + F.pad(v, (3, 0))
+    square = torch.linalg.cross(w, X, dim=-2)
+    cube = torch.linalg.cross(w, square, dim=-2)
+    B, C = _exponential_coefficients(w.square().sum(-2, keepdim=True))
+    return identity + F.pad(X + B * square + C * cube, (0, 0, 0, 1))
 
 
 def _exponential_coefficients(squared: Tensor) -> tuple[Tensor, Tensor]:
@@ -88,8 +87,8 @@ def _exponential_coefficients(squared: Tensor) -> tuple[Tensor, Tensor]:
 def _alternating_series(s: Tensor, first: int) -> Tensor:
     """Σ (−s)ᵏ / (2k + first)! to rounding for s below the limit above."""
     last = 5 if s.dtype == torch.float64 else 3
-    total = torch.full_like(s, 1.0 / math.factorial(2 * last + first))
-    for k in range(last - 1, -1, -1):
+    total = 1.0 / math.factorial(2 * last - 2 + first) - s * (1.0 / math.factorial(2 * last + first))
+    for k in range(last - 2, -1, -1):
         total = 1.0 / math.factorial(2 * k + first) - s * total
     return total
 

@@ -106,8 +106,8 @@ def levenberg_marquardt(
     initial_cost = cost
     damping = torch.full_like(cost.detach(), initial_damping)
     iterations = torch.zeros(T.shape[0], dtype=torch.int64, device=T.device)
-    converged = torch.zeros(T.shape[0], dtype=torch.bool, device=T.device)
     failed = ~(_finite(cost, H, g) & (H.diagonal(dim1=-2, dim2=-1).amax(-1) > 0))
+    active = ~failed
     # Unit systems stand in for those that cannot be solved, so that no NaN enters the graph; what is accepted below
     # is finite.
     initial_H = H
@@ -116,27 +116,26 @@ def levenberg_marquardt(
     g = torch.where(failed[:, None], 0.0, g)
 
     for iteration in range(max_iterations):
-        active = ~(converged | failed)
         if iteration % chunk == 0 and not bool(active.any()):
             break
-        step, solved = _solve(H, g, damping)
-        predicted = -((g + 0.5 * (H @ step.unsqueeze(-1)).squeeze(-1)) * step).sum(-1).detach()
-        finished = solved & (predicted <= relative * cost.detach() + floor)
-
-        T_new = se3_exp(step) @ T
+        step, predicted, solved = _solve(H, g, damping)
+        T_new = torch.bmm(se3_exp(step), T)
         cost_new, H_new, g_new = evaluate(T_new)
         # A decrease below rounding may look like a rise, but the step still brings g closer to zero.
         rounding = eps * cost.detach()
         most = torch.where(predicted <= rounding, cost + rounding, cost)
+        finished = solved & (predicted <= relative * cost.detach() + floor)
         accepted = active & solved & (cost_new <= most) & _finite(cost_new, H_new, g_new)
-        T = torch.where(accepted[:, None, None], T_new, T)
+        row, matrix = accepted.unsqueeze(-1), accepted[:, None, None]
+        T = torch.where(matrix, T_new, T)
         cost = torch.where(accepted, cost_new, cost)
-        H = torch.where(accepted[:, None, None], H_new, H)
-        g = torch.where(accepted[:, None], g_new, g)
+        H = torch.where(matrix, H_new, H)
+        g = torch.where(row, g_new, g)
 
         damping = torch.where(accepted, damping * 0.1, damping * 10.0).clamp(1e-10, 1e10)
-        iterations = iterations + active.to(iterations.dtype)
-        converged = converged | (active & finished)
+        iterations = iterations + active
+        active = active & ~finished
+    converged = ~(active | failed)
     H = torch.where(failed[:, None, None], initial_H, H)
     regular = torch.ones_like(failed)
     return LevenbergMarquardtResult(T, cost, initial_cost, iterations, converged, failed, H, regular)
@@ -144,22 +143,26 @@ def levenberg_marquardt(
 
 def _finite(cost: Tensor, H: Tensor, g: Tensor) -> Tensor:
     # A sum is finite only if all its terms are.
-    return torch.isfinite(cost + H.detach().sum((-1, -2)) + g.detach().sum(-1))
+    return (cost + (H.sum(-1) + g).sum(-1)).detach().abs() < torch.inf
 
 
-def _solve(H: Tensor, g: Tensor, damping: Tensor) -> tuple[Tensor, Tensor]:
-    """Damped step (B, 6) of finite systems and whether it could be solved for (B,); it is zero where it could not."""
-    diagonal = H.diagonal(dim1=-2, dim2=-1)
-    limits = torch.finfo(H.dtype)
-    # Solving in the scaled variables keeps the condition number free of the units.
-    root = torch.maximum(diagonal, limits.eps * diagonal.amax(-1, keepdim=True)).clamp(min=limits.tiny).sqrt()
-    scaled = H / (root.unsqueeze(-1) * root.unsqueeze(-2))
-    scaled.diagonal(dim1=-2, dim2=-1).add_(damping.unsqueeze(-1))
-    factor, info = torch.linalg.cholesky_ex(scaled.detach())
+def _solve(H: Tensor, g: Tensor, damping: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Damped step (B, 6) of finite systems, the decrease that it promises (B,), a constant, and whether it could be
+    solved for (B,); it is zero where it could not."""
+    diagonal, limits = H.diagonal(dim1=-2, dim2=-1), torch.finfo(H.dtype)
+    # Cholesky's factorisation rounds as if the diagonal were ones, so units need no scaling; what has no curvature
+    # is damped as if it had as little as the numbers can tell.
+    least = (limits.eps * diagonal.amax(-1, keepdim=True)).clamp(min=limits.tiny)
+    added = damping.unsqueeze(-1) * torch.maximum(diagonal, least)
+    damped = H + torch.diag_embed(added)
+    factor, info = torch.linalg.cholesky_ex(damped.detach())
     solved = info == 0
     if torch.is_grad_enabled():
         # Its derivative would be NaN where it fails.
         identity = torch.eye(6, dtype=H.dtype, device=H.device)
-        factor = torch.linalg.cholesky_ex(torch.where(solved[:, None, None], scaled, identity)).L
-    step = -torch.cholesky_solve((g / root).unsqueeze(-1), factor).squeeze(-1) / root
-    return torch.where(solved[:, None], step, 0.0), solved
+        factor = torch.linalg.cholesky_ex(torch.where(solved[:, None, None], damped, identity)).L
+    step = torch.cholesky_solve(g.unsqueeze(-1), factor).squeeze(-1)
+    step = torch.where(solved.unsqueeze(-1), -step, 0.0)
+    # −gᵀ δ − ½ δᵀ H δ, as (H + D) δ = −g with the damping D.
+    predicted = 0.5 * (step * (added * step - g)).sum(-1).detach()
+    return step, predicted, solved

@@ -69,9 +69,9 @@ class LocalFrame(NamedTuple):
         rotated = torch.baddbmm(T_local[:, :3, 3:], T_local[:, :3, :3], points_local.transpose(1, 2))
         points_camera = self.origin.unsqueeze(-1) + size * rotated
         depth = points_camera[:, 2:]
-        inverse = 1.0 / torch.where(depth > 0, depth, torch.ones_like(depth))
+        inverse = torch.where(depth > 0, depth, 1.0).reciprocal()
         centre, focal = K[:, :2, 2:], K[:, :2, :2]
-        from_centre = focal @ (points_camera[:, :2] * inverse)
+        from_centre = torch.bmm(focal, points_camera[:, :2] * inverse)
         # d pixels / d points_camera times size, then d points_camera / d δ = size [I, −[rotated]×].
         scaled = inverse * size
         by_plane = focal.transpose(1, 2).unsqueeze(-1) * scaled.unsqueeze(1)

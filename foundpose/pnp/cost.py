@@ -26,7 +26,6 @@ def reprojection_cost(
     """
     points_local, target = frame.points(problem.points_model), problem.points_image.transpose(1, 2)
     weights, used = problem.weights, problem.weights > 0
-    zero = torch.zeros_like(weights)
 
     def evaluate(T_local: Tensor) -> NormalEquations:
         pixels, depth, J = frame.project(T_local, points_local, problem.K)
@@ -34,12 +33,14 @@ def reprojection_cost(
         residual = pixels - target
         rho, slope = loss(residual.square().sum(1))
         # Points out of use may lie anywhere, also where their residual overflows.
-        cost = 0.5 * torch.where(used, weights * rho, zero).sum(-1)
-        cost = cost.masked_fill((used & ~in_front).any(-1), torch.inf)
-        share = torch.where(used & in_front, weights * slope, zero)
-        weighted = (J * share[:, None, None]).flatten(2)
-        H = weighted @ J.flatten(2).transpose(1, 2)
-        g = (weighted @ residual.flatten(1).unsqueeze(-1)).squeeze(-1)
+        cost = 0.5 * torch.where(used, weights * rho, 0.0).sum(-1)
+        counts = used & in_front
+        cost = cost.masked_fill((used ^ counts).any(-1), torch.inf)
+        share = torch.where(counts, weights * slope, 0.0)
+        J = J.flatten(2)
+        weighted = J * torch.cat([share, share], dim=-1).unsqueeze(1)
+        H = torch.bmm(weighted, J.transpose(1, 2))
+        g = torch.bmm(weighted, residual.flatten(1).unsqueeze(-1)).squeeze(-1)
         return NormalEquations(cost, H, g)
 
     return evaluate
@@ -60,17 +61,15 @@ def reprojection_errors(T: Tensor, problem: PnpProblem) -> tuple[Tensor, Tensor]
         distance means nothing. Differentiable w.r.t. all tensors.
     """
     rows = (slice(None), *[None] * (T.dim() - 3))
-    x, y, z = problem.points_model[rows].unbind(-1)
-    observed, M = problem.points_image[rows], problem.K[rows][..., None]
-    R, t = T[..., :3, :3, None], T[..., :3, 3, None]
-    x, y, depth = (
-        R[..., i, 0, :] * x + R[..., i, 1, :] * y + R[..., i, 2, :] * z + t[..., i, :] for i in range(3)
-    )
-    inverse = 1.0 / torch.where(depth > 0, depth, torch.ones_like(depth))
-    x, y = x * inverse, y * inverse
-    u = M[..., 0, 0, :] * x + M[..., 0, 1, :] * y + (M[..., 0, 2, :] - observed[..., 0])
-    v = M[..., 1, 0, :] * x + M[..., 1, 1, :] * y + (M[..., 1, 2, :] - observed[..., 1])
-    return u * u + v * v, depth
+    K = problem.K[rows]
+    x, y, z = (T[..., :3, :3, None] * problem.points_model[rows].transpose(-1, -2).unsqueeze(-3)).unbind(-2)
+    camera = x + y + z + T[..., :3, 3:]
+    depth = camera[..., 2, :]
+    plane = camera[..., :2, :] * torch.where(depth > 0, depth, 1.0).reciprocal().unsqueeze(-2)
+    x, y = (K[..., :2, :2, None] * plane.unsqueeze(-3)).unbind(-2)
+    residual = x + y + (K[..., :2, 2:] - problem.points_image[rows].transpose(-1, -2))
+    u, v = residual.square().unbind(-2)
+    return u + v, depth
 
 
 def select_inliers(
@@ -84,5 +83,5 @@ def select_inliers(
     """
     squared, depth = reprojection_errors(T.detach(), problem.detach())
     inliers = (squared <= threshold**2) & (depth > 0) & problem.valid
-    truncated = torch.where(inliers, squared, torch.full_like(squared, threshold**2))
+    truncated = torch.where(inliers, squared, threshold**2)
     return inliers, (loss(truncated)[0].detach() * problem.weights.detach()).sum(-1)

@@ -129,6 +129,7 @@ class LevenbergMarquardtPnp(nn.Module):
         problem: PnpProblem,
         tolerance: float | None = None,
         max_iterations: int | None = None,
+        clean: bool = False,
     ) -> tuple[LevenbergMarquardtResult, LocalFrame]:
         """What :meth:`forward` does, without the covariance.
 
@@ -137,6 +138,7 @@ class LevenbergMarquardtPnp(nn.Module):
             problem: see :meth:`forward`.
             tolerance: takes the place of this module's own.
             max_iterations: lowers this module's own.
+            clean: all numbers are known to be finite, and what is not valid has no weight: nothing is checked.
 
         Returns:
             A :class:`~foundpose.optimization.LevenbergMarquardtResult` with costs in px², and the frame that its
@@ -144,23 +146,9 @@ class LevenbergMarquardtPnp(nn.Module):
             point, or any number in which is not finite, comes back as it was with ``failed`` set and without a
             gradient.
         """
-        T, K = T_camera_from_model, problem.K
-        weights = problem.weights.masked_fill(~problem.valid, 0.0)
-        finite = usable_coordinates(problem.points_image) & usable_coordinates(problem.points_model)
-        sane = torch.isfinite(T).all(-1).all(-1) & torch.isfinite(K).all(-1).all(-1)
-        sane = sane & (torch.isfinite(weights) & (finite | (weights == 0))).all(-1)
-        # Stand-ins without weight, which fail: no NaN may enter the graph, not even multiplied by zero.
-        identity = torch.eye(4, dtype=T.dtype, device=T.device)
-        T = torch.where(sane[:, None, None], T, identity)
-        weights = weights.masked_fill(~(sane.unsqueeze(-1) & (weights > 0)), 0.0)
-        left_out = (weights == 0).unsqueeze(-1)
-        problem = PnpProblem(
-            problem.points_image.masked_fill(left_out, 0.0),
-            problem.points_model.masked_fill(left_out, 0.0),
-            torch.where(sane[:, None, None], K, identity[:3, :3]),
-            problem.valid,
-            weights,
-        )
+        T = T_camera_from_model
+        if not clean:
+            T, problem, sane = _sanitise(T, problem)
         implicit = self.differentiation == "implicit"
         # The optimum does not depend on the frame that it is looked for in, nor on where the search begins.
         frame = _local_frame(T.detach(), problem.detach()) if implicit else _local_frame(T, problem)
@@ -172,9 +160,11 @@ class LevenbergMarquardtPnp(nn.Module):
             differentiation=self.differentiation,
             max_iterations=min(self.max_iterations, max_iterations or self.max_iterations),
             tolerance=self.tolerance if tolerance is None else tolerance,
-            floor=weights.detach().sum(-1) * rounding.square(),
+            floor=problem.weights.detach().sum(-1) * rounding.square(),
         )
-        T = torch.where(sane[:, None, None], frame.pose_from_local(result.T), T_camera_from_model)
+        T = frame.pose_from_local(result.T)
+        if not clean:
+            T = torch.where(sane[:, None, None], T, T_camera_from_model)
         return result._replace(T=T), frame
 
     def attach_gradient(self, T_camera_from_model: Tensor, problem: PnpProblem) -> tuple[Tensor, Tensor]:
@@ -201,6 +191,26 @@ class LevenbergMarquardtPnp(nn.Module):
         residual = torch.where(used, problem.weights * slope * squared, 0.0).sum(-1)
         # Two equations a point, of which a robust loss counts but a part, against six unknowns.
         return residual_variance(residual, 2.0 * slope.sum(-1) - 6.0)
+
+
+def _sanitise(T: Tensor, problem: PnpProblem) -> tuple[Tensor, PnpProblem, Tensor]:
+    """Poses and problems with stand-ins without weight, which fail, for what is not finite, and which are as they
+    were (B,): no NaN may enter the graph, not even multiplied by zero."""
+    weights = problem.weights.masked_fill(~problem.valid, 0.0)
+    finite = usable_coordinates(problem.points_image) & usable_coordinates(problem.points_model)
+    sane = torch.isfinite(T).all(-1).all(-1) & torch.isfinite(problem.K).all(-1).all(-1)
+    sane = sane & (torch.isfinite(weights) & (finite | (weights == 0))).all(-1)
+    identity = torch.eye(4, dtype=T.dtype, device=T.device)
+    weights = weights.masked_fill(~(sane.unsqueeze(-1) & (weights > 0)), 0.0)
+    left_out = (weights == 0).unsqueeze(-1)
+    problem = PnpProblem(
+        problem.points_image.masked_fill(left_out, 0.0),
+        problem.points_model.masked_fill(left_out, 0.0),
+        torch.where(sane[:, None, None], problem.K, identity[:3, :3]),
+        problem.valid,
+        weights,
+    )
+    return torch.where(sane[:, None, None], T, identity), problem, sane
 
 
 def _local_frame(T: Tensor, problem: PnpProblem) -> LocalFrame:

@@ -91,7 +91,7 @@ class LocalOptimization:
             for factor in _WIDE:
                 inliers, _ = select_inliers(T, problem, factor * self.threshold, self.polish.loss)
                 enough = inliers.sum(-1) >= _LEAST_POLISHED
-                rough, _ = self.polish.optimise(T, problem.only(inliers), _ROUGH, _WIDE_STEPS)
+                rough, _ = self.polish.optimise(T, problem.only(inliers), _ROUGH, _WIDE_STEPS, clean=True)
                 T = torch.where(enough[:, None, None], rough.T, T)
         return T
 
@@ -123,7 +123,7 @@ class LocalOptimization:
         steps: int | None = None,
     ) -> tuple[_State, Tensor]:
         """Polish poses on their inliers, and select these anew, where that does not raise the truncated cost (P,)."""
-        T = self.polish.optimise(before.T, problem.only(before.inliers), tolerance, steps)[0].T
+        T = self.polish.optimise(before.T, problem.only(before.inliers), tolerance, steps, clean=True)[0].T
         after = self._select(T, problem)._replace(used=before.inliers)
         # Equal but for rounding counts as equal, or rounding would decide whether the last polish is kept.
         most = before.cost * (1.0 + 64.0 * torch.finfo(before.cost.dtype).eps)

@@ -3,7 +3,7 @@
 from typing import Literal, NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from foundpose.geometry import PatchGrid
 from foundpose.optimization import BarronLoss, Huber, NormalEquations, RobustLoss
@@ -62,13 +62,20 @@ class Linearisation(NamedTuple):
 
     Attributes:
         equations: normal equations of ½ mean ρ.
-        energy: (n,) weighted sum of the squared residuals; a constant for autograd.
-        weights: (n,) sum of the weights; a constant for autograd.
+        squared: (n, P, d or 1) squared residuals.
+        weights: (n, P, d or 1) their weights in the equations, but for the share of their patch.
+        share: (n, P) one by the number of patches, zero for a patch that is not seen.
     """
 
     equations: NormalEquations
-    energy: Tensor
+    squared: Tensor
     weights: Tensor
+    share: Tensor
+
+    def totals(self) -> tuple[Tensor, Tensor]:
+        """Weighted sum of the squared residuals (n,), and sum of the weights (n,); constants for autograd."""
+        weights = (self.weights * self.share.unsqueeze(-1)).detach()
+        return (weights * self.squared.detach()).sum((-1, -2)), weights.sum((-1, -2))
 
 
 class FeaturemetricCost:
@@ -104,13 +111,14 @@ class FeaturemetricCost:
         self.interpolation = interpolation
         self.points_local = frame.points(problem.points_model)
         self.count = problem.valid.sum(-1).clamp(min=1)
-        # Minus the descriptors, and two rows of zeros: what is sampled is added to them.
-        self._offset = nn.functional.pad(-problem.descriptors.unsqueeze(2), (0, 0, 0, 2))
         self._unit = self._measured_unit(T_local, auto_scale) if auto_scale else None
         descriptors = problem.descriptors.detach()
         self.ceiling = self._ceiling(
             descriptors if self._unit is None else descriptors * self._unit[:, None, None]
         )
+        # What a patch costs while it is not seen.
+        self._lost = self.ceiling.masked_fill(~problem.valid, 0.0)
+        self._per_patch = self.count.to(self._lost.dtype).reciprocal()
 
     def __call__(self, T_local: Tensor) -> Linearisation:
         """Linearise the cost at poses (n, 4, 4) for ``T_local ← exp(δ) @ T_local``; differentiable."""
@@ -121,26 +129,21 @@ class FeaturemetricCost:
         if self.residual == "norm":
             squared = squared.sum(-1, keepdim=True)
         rho, weight = self.loss(squared)
-        valid, count = self.problem.valid, self.count.to(rho.dtype)
-        lost = valid & ~seen
-        cost = torch.where(seen, rho.sum(-1), self.ceiling.masked_fill(~lost, 0.0))
-        weight = weight * (seen / count.unsqueeze(-1)).unsqueeze(-1)
-        # All channels of a patch come down to the products of its three rows.
-        products = (rows * weight.unsqueeze(2)).flatten(0, 1) @ rows.flatten(0, 1).transpose(1, 2)
-        products = products.unflatten(0, valid.shape).permute(0, 2, 3, 1)  # (n, 3, 3, P)
-        gram, pull = products[:, 1:, 1:], products[:, 1:, 0]
-        weighted = (J * gram[:, None, 0]).sum(2), (J * gram[:, None, 1]).sum(2)
-        H = torch.stack(weighted, dim=2).flatten(2) @ J.flatten(2).transpose(1, 2)
-        g = (J.flatten(2) @ pull.flatten(1).unsqueeze(-1)).squeeze(-1)
-        return Linearisation(
-            NormalEquations(0.5 * cost.sum(-1) / count, H, g),
-            energy=products[:, 0, 0].sum(-1).detach(),
-            weights=weight.sum((-1, -2)).detach(),
-        )
+        cost = torch.where(seen, rho.sum(-1), self._lost).sum(-1) * self._per_patch
+        # All channels of a patch come down to the products of its slopes with its three rows.
+        slopes = (rows[:, :, 1:] * weight.unsqueeze(2)).flatten(0, 1)
+        share = seen * self._per_patch.unsqueeze(-1)
+        products = torch.bmm(slopes, rows.flatten(0, 1).transpose(1, 2)) * share.reshape(-1, 1, 1)
+        products = products.unflatten(0, seen.shape).permute(0, 2, 3, 1)  # (n, 2, 3, P)
+        weighted = (J.unsqueeze(2) * products[:, None, :, 1:]).sum(3).flatten(2)
+        J = J.flatten(2)
+        H = torch.bmm(weighted, J.transpose(1, 2))
+        g = torch.bmm(J, products[:, :, 0].flatten(1).unsqueeze(-1)).squeeze(-1)
+        return Linearisation(NormalEquations(0.5 * cost, H, g), squared, weight, share)
 
     def mean_ceiling(self) -> Tensor:
         """Mean ρ (n,) if no patch were seen."""
-        return self.ceiling.masked_fill(~self.problem.valid, 0.0).sum(-1) / self.count
+        return self._lost.sum(-1) * self._per_patch
 
     def _residual_rows(self, T_local: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Residuals of patches and their slopes along columns and rows of the map (n, P, 3, d), which patches are
@@ -149,10 +152,11 @@ class FeaturemetricCost:
         pixels, depth, J = self.frame.project(T_local, self.points_local, problem.K)
         inside = ((pixels >= -0.5) & (pixels <= maps.image_size - 0.5)).all(1)
         seen = problem.valid & (depth > 0) & inside
-        pixels = torch.where(seen.unsqueeze(1), pixels, torch.zeros_like(pixels))
+        pixels = torch.where(seen.unsqueeze(1), pixels, 0.0)
         position = maps.grid.to_map(pixels).transpose(1, 2)
-        rows = sample_features(maps.values, problem.map_index, position, self.interpolation, self._offset)
-        J = torch.where(seen[:, None, None], J, torch.zeros_like(J)) / maps.grid.stride
+        rows = sample_features(maps.values, problem.map_index, position, self.interpolation)
+        rows[:, :, 0].sub_(problem.descriptors)
+        J = torch.where(seen[:, None, None], J, 0.0) / maps.grid.stride
         return rows, seen, J
 
     @torch.no_grad()

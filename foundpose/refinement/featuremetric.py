@@ -176,6 +176,7 @@ class FeaturemetricAlignment(nn.Module):
         )
         with torch.no_grad():
             seen = cost(result.T)
+            energy, weights = seen.totals()
         improved = ~result.failed & (result.cost < result.initial_cost)
         T_aligned = frame.pose_from_local(result.T)
         # A start that is the optimum already keeps its value to the bit, but has the optimum's gradient.
@@ -183,7 +184,7 @@ class FeaturemetricAlignment(nn.Module):
         T_final = torch.where(improved[:, None, None], T_aligned, T_kept)
         # The equations have the half of the mean of ρ.
         least = 2.0 * result.cost
-        variance = residual_variance(seen.energy, seen.weights * cost.count - 6.0)
+        variance = residual_variance(energy, weights * cost.count - 6.0)
         return Alignment(
             T_crop_from_model=T_final,
             cost=least,

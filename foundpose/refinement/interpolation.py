@@ -3,6 +3,7 @@
 from typing import Literal
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 Interpolation = Literal["bilinear", "bicubic"]
@@ -14,7 +15,6 @@ def sample_features(
     map_index: Tensor,
     position: Tensor,
     interpolation: Interpolation = "bilinear",
-    offset: Tensor | None = None,
 ) -> Tensor:
     """Values and derivatives of feature maps at real positions.
 
@@ -25,7 +25,6 @@ def sample_features(
         map_index: (n,) which map each row of positions is for, int64.
         position: (n, P, 2) as (column, row).
         interpolation: "bilinear", or "bicubic" (Keys' cubic convolution: its slopes are continuous).
-        offset: (n, P, 3, d) added to what is returned; costs nothing.
 
     Returns:
         (n, P, 3, d): the value, its derivative along columns and that along rows. Differentiable w.r.t.
@@ -41,19 +40,25 @@ def sample_features(
         column, across, across_slope = _kernel(position[..., 0], w, interpolation)
         row, down, down_slope = _kernel(position[..., 1], h, interpolation)
     cell = (map_index[:, None, None] * h + row).unsqueeze(-1) * w + column.unsqueeze(-2)  # (n, P, k, k)
+    vertical, horizontal = torch.stack([down, down, down_slope]), torch.stack([across, across_slope, across])
+    weights = (vertical.unsqueeze(-1) * horizontal.unsqueeze(-2)).flatten(3).flatten(1, 2)  # (3, n P, k²)
+    table, cell = features.reshape(-1, d), cell.flatten(2).flatten(0, 1)
+    sampled = _weighted_rows(table, cell, weights).unflatten(1, position.shape[:2])
+    return sampled.permute(1, 2, 0, 3)
+
+
+def _weighted_rows(table: Tensor, cell: Tensor, weights: Tensor) -> Tensor:
+    """Sums (s, n, d) of rows of a table (m, d), chosen by (n, k) and weighted by (s, n, k)."""
+    if table.device.type == "cpu":
+        # In one pass that writes no more than the sums: a third to a seventh of the time.
+        bags = cell.repeat(len(weights), 1)
+        flat = weights.flatten(0, 1)
+        return F.embedding_bag(bags, table, per_sample_weights=flat, mode="sum").unflatten(
+            0, weights.shape[:2]
+        )
     # Whole rows: several times as fast as indexing by a tensor.
-    read = features.reshape(-1, d).index_select(0, cell.flatten()).unflatten(0, (-1, cell[0, 0].numel()))
-    weights = torch.stack(
-        [
-            down.unsqueeze(-1) * across.unsqueeze(-2),
-            down.unsqueeze(-1) * across_slope.unsqueeze(-2),
-            down_slope.unsqueeze(-1) * across.unsqueeze(-2),
-        ],
-        dim=-3,
-    )
-    weights = weights.flatten(-2).flatten(0, 1)
-    sampled = weights @ read if offset is None else torch.baddbmm(offset.flatten(0, 1), weights, read)
-    return sampled.unflatten(0, position.shape[:2])
+    rows = table.index_select(0, cell.flatten()).unflatten(0, cell.shape)
+    return (weights.transpose(0, 1) @ rows).transpose(0, 1)
 
 
 def _kernel(position: Tensor, size: int, interpolation: Interpolation) -> tuple[Tensor, Tensor, Tensor]:
