@@ -1,11 +1,14 @@
 """6D pose of unseen objects from one RGB image: FoundPose (ECCV 2024) as differentiable, batched modules."""
 
 from foundpose.config import load
+from foundpose.detection import Detector
 from foundpose.features import DenseSift, DinoV2, FeatureHook, PatchExtractor, PcaProjection
 from foundpose.geometry import PerspectiveCrop, SphereInplane, SuperFibonacci
 from foundpose.matching import PatchMatcher, SoftPatchMatcher
 from foundpose.onboarding import Onboarder, RepresentationStore
 from foundpose.pipeline import (
+    DetectAndEstimate,
+    FoundInstances,
     FoundPose,
     InlierScore,
     MatchAndSolve,
@@ -38,9 +41,12 @@ __version__ = "0.1.0"
 __all__ = [
     "ClsRetriever",
     "DenseSift",
+    "DetectAndEstimate",
+    "Detector",
     "DinoV2",
     "FeatureHook",
     "FeaturemetricRefiner",
+    "FoundInstances",
     "FoundPose",
     "InlierScore",
     "LevenbergMarquardtPnp",

@@ -2,7 +2,7 @@
 
 import hashlib
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from threading import Thread
@@ -108,14 +108,8 @@ def load_transformers(weights: str | Path, model: HubModel) -> nn.Module:
         WeightsNotFoundError: no weights there.
         ValueError: the weights are those of another model or variant, or incomplete.
     """
-    from huggingface_hub import try_to_load_from_cache
     from transformers import AutoConfig
 
-    # A path that is not there must not be taken for the name of a repository.
-    if weights != "hub" and not (Path(weights) / "config.json").is_file():
-        raise WeightsNotFoundError(
-            f"no folder with weights in transformers' format at {weights}.\n{model.how}"
-        )
     config = model.config
     name = model.repository if weights == "hub" else str(weights)
 
@@ -131,6 +125,29 @@ def load_transformers(weights: str | Path, model: HubModel) -> nn.Module:
         check_sizes({n: getattr(found, n, 0) for n in model.sizes}, model.sizes, name, model.variants)
         return build_transformers(config, source, None, name)
 
+    return from_hub_or_folder(load, weights, model.repository, model.how)
+
+
+def from_hub_or_folder(
+    load: Callable[[str], nn.Module], weights: str | Path, repository: str, how: str
+) -> nn.Module:
+    """Load a model of transformers from the hub's cache, the hub, or a folder.
+
+    Args:
+        load: loads from a folder, or from the hub by the name of a repository.
+        weights: ``"hub"`` or a folder.
+        repository: on the hub.
+        how: instructions to get the weights.
+
+    Raises:
+        WeightsNotFoundError: no weights there.
+    """
+    from huggingface_hub import try_to_load_from_cache
+
+    # A path that is not there must not be taken for the name of a repository.
+    if weights != "hub" and not (Path(weights) / "config.json").is_file():
+        raise WeightsNotFoundError(f"no folder with weights in transformers' format at {weights}.\n{how}")
+    name = repository if weights == "hub" else str(weights)
     try:
         if weights != "hub":
             return load(name)
@@ -142,7 +159,7 @@ def load_transformers(weights: str | Path, model: HubModel) -> nn.Module:
         _check_hub_answers(name)
         return load(name)
     except OSError as error:
-        raise WeightsNotFoundError(f"could not load weights from {name}: {error}\n{model.how}") from error
+        raise WeightsNotFoundError(f"could not load weights from {name}: {error}\n{how}") from error
 
 
 def build_transformers(

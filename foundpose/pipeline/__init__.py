@@ -1,5 +1,6 @@
 """The composed method: crop, describe, retrieve, match, solve, choose, refine."""
 
+from foundpose.pipeline.finding import DetectAndEstimate, FoundInstances
 from foundpose.pipeline.foundpose import FoundPose
 from foundpose.pipeline.hypotheses import HypothesisMaker, MatchAndSolve, TemplateHypotheses
 from foundpose.pipeline.query import select_query_patches
@@ -14,6 +15,8 @@ from foundpose.pipeline.verification import HypothesisScorer, InlierScore, Patch
 
 __all__ = [
     "Correspondences",
+    "DetectAndEstimate",
+    "FoundInstances",
     "FoundPose",
     "HypothesisMaker",
     "HypothesisScorer",
