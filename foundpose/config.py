@@ -20,6 +20,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from foundpose.bop import BopDataset
+from foundpose.detection import Detector
 from foundpose.features import PatchExtractor
 from foundpose.onboarding import ArtefactStore, Onboarder, RepresentationStore
 from foundpose.pipeline import FoundPose
@@ -109,6 +110,12 @@ def build_method(cfg: DictConfig) -> Method:
             None if cfg.get("artefacts") is None else ArtefactStore(cfg.artefacts),
         ),
     )
+
+
+def build_detector(cfg: DictConfig, extractor: PatchExtractor) -> Detector:
+    """The detector of a configuration, on the device of the extractor that it shares with the pipeline."""
+    detector: Detector = instantiate(cfg.detector, extractor=extractor)
+    return detector.to(cfg.device).eval()
 
 
 def wanted_objects(cfg: DictConfig, dataset: BopDataset) -> list[int]:

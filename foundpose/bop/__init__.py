@@ -2,7 +2,7 @@
 
 from foundpose.bop.dataset import BopDataset
 from foundpose.bop.detection_scores import DetectionScores, detection_scores
-from foundpose.bop.files import BopError
+from foundpose.bop.files import BopError, read_json
 from foundpose.bop.instances import Instance, detected_instances, ground_truth_instances
 from foundpose.bop.masks import largest_component, plausible_mask, read_mask
 from foundpose.bop.precision import PosePrecision, score_pose_detections
@@ -18,7 +18,7 @@ from foundpose.bop.results import (
 from foundpose.bop.scenes import Annotation
 from foundpose.bop.scores import Scores
 from foundpose.bop.scoring import check_functions, score_results
-from foundpose.bop.segmentation import decode_segmentation
+from foundpose.bop.segmentation import decode_segmentation, encode_segmentation
 from foundpose.bop.targets import Target
 from foundpose.utils.pictures import PictureError, read_depth, read_image
 
@@ -39,11 +39,13 @@ __all__ = [
     "decode_segmentation",
     "detected_instances",
     "detection_scores",
+    "encode_segmentation",
     "ground_truth_instances",
     "largest_component",
     "plausible_mask",
     "read_depth",
     "read_image",
+    "read_json",
     "read_mask",
     "read_results",
     "result_file_name",

@@ -103,3 +103,9 @@ def _checked_polygons(polygons: Sequence[Any]) -> list[list[float]]:
     if not polygons:
         raise BopError("the list of polygons is empty")
     return [list(map(float, polygon)) for polygon in polygons]
+
+
+def encode_segmentation(mask: Tensor) -> dict[str, Any]:
+    """COCO's run lengths of a mask (H, W) bool, as the string that JSON holds."""
+    packed = coco_mask.encode(np.asfortranarray(mask.cpu().numpy().astype(np.uint8)))
+    return {"size": list(packed["size"]), "counts": packed["counts"].decode()}

@@ -129,13 +129,19 @@ class CropScorer(ProposalScorer):
         views: number of the most similar templates.
         patches: weight of the mean patch beside the global descriptor, in [0, 1]; 1 where the extractor has no
             global descriptor.
+        rivals: so much of a region's lead over the other objects is added.
         batch_size: crops that are described at a time.
 
     Source: Nguyen et al., "CNOS: A Strong Baseline for CAD-based Novel Object Segmentation", 2023.
     """
 
     def __init__(
-        self, crop: PerspectiveCrop, views: int = 5, patches: float = 0.5, batch_size: int = 16
+        self,
+        crop: PerspectiveCrop,
+        views: int = 5,
+        patches: float = 0.5,
+        rivals: float = 0.5,
+        batch_size: int = 16,
     ) -> None:
         super().__init__()
         _check_views(views)
@@ -146,6 +152,7 @@ class CropScorer(ProposalScorer):
         self.crop = crop
         self.views = views
         self.patches = patches
+        self.rivals = rivals
         self.batch_size = batch_size
         self.means = TemplateMeans()
 
@@ -188,7 +195,7 @@ class CropScorer(ProposalScorer):
                 score = self.patches * score + (1 - self.patches) * of_cls
             scores.append(score)
         usable = crops.valid & (inside.sum(-1) > 0)[:, 0]
-        compared = torch.stack(scores, dim=-1)
+        compared = _with_lead(torch.stack(scores, dim=-1), self.rivals)
         return torch.where(usable[:, None], compared, compared.new_zeros(())).float()
 
 
@@ -196,6 +203,14 @@ def _nearest_views(descriptors: Tensor, templates: Tensor, views: int) -> Tensor
     """Mean cosine similarity (B,) of descriptors (B, C) to the most similar templates (T, C)."""
     cosine = F.normalize(descriptors, dim=1) @ F.normalize(templates.to(descriptors), dim=1).T
     return cosine.topk(min(views, len(templates)), dim=1).values.mean(dim=1)
+
+
+def _with_lead(similarity: Tensor, weight: float) -> Tensor:
+    """Similarities (..., O) with so much of their lead over the best other object added."""
+    if similarity.shape[-1] < 2:
+        return similarity
+    best, second = similarity.topk(2, dim=-1).values.split(1, dim=-1)
+    return similarity + weight * (similarity - torch.where(similarity == best, second, best))
 
 
 def _check_views(views: int) -> None:

@@ -2,6 +2,7 @@
 
 import logging
 import warnings
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +25,9 @@ from foundpose.bop import (
     score_results,
     write_results,
 )
-from foundpose.config import build_method, claim_run_folder, wanted_objects
+from foundpose.config import Method, build_detector, build_method, claim_run_folder, wanted_objects
 from foundpose.evaluation.data import PoseDataModule
+from foundpose.evaluation.detecting import Pictures, detect_dataset
 from foundpose.evaluation.module import PoseEvaluation, estimate_dataset
 from foundpose.evaluation.objects import DatasetObjects
 from foundpose.evaluation.records import to_results
@@ -82,13 +84,16 @@ def _estimate(cfg: DictConfig, dataset: BopDataset, wanted: list[int], output: P
     masks = instantiate(cfg.masks)
     method = build_method(cfg)
     objects = DatasetObjects(dataset, method.store, cfg.memory_limit, color=cfg.color)
+    pictures = instantiate(cfg.pictures)
+    if "path" in cfg.masks and cfg.masks.path is None:
+        masks = partial(masks, path=_detect(cfg, method, objects, pictures, wanted, output))
     data: PoseDataModule = instantiate(
         cfg.data_module,
         dataset=dataset,
         masks=masks,
         objects=objects,
         folder=output,
-        pictures=instantiate(cfg.pictures),
+        pictures=pictures,
         object_ids=wanted,
         max_images=cfg.max_images,
     )
@@ -116,6 +121,22 @@ def _estimate(cfg: DictConfig, dataset: BopDataset, wanted: list[int], output: P
     instances = sorted(found, key=lambda i: (i.scene_id, i.im_id, i.obj_id))
     device = trainer.strategy.root_device
     return Estimated(dataset, data.pictures, objects, method.pipeline, device, instances, records)
+
+
+def _detect(
+    cfg: DictConfig,
+    method: Method,
+    objects: DatasetObjects,
+    pictures: Pictures,
+    wanted: list[int],
+    output: Path,
+) -> Path:
+    """The run's own detections."""
+    claim_run_folder(output, cfg)
+    detector = build_detector(cfg, method.onboarder.extractor)
+    objects.onboard(wanted, ProgressBars)
+    images = objects.dataset.images()[: cfg.max_images]
+    return detect_dataset(detector, objects, pictures, images, wanted, output, ProgressBars())
 
 
 def memory(objects: DatasetObjects, ids: list[int]) -> dict[str, dict[str, int]]:

@@ -1,5 +1,8 @@
 """Drawing on pictures."""
 
+from collections.abc import Sequence
+from colorsys import hsv_to_rgb
+
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -56,6 +59,33 @@ def draw_axes(image: Tensor, T_camera_from_model: Tensor, K: Tensor, length: flo
     origin, *tips = [tuple(pixel) for pixel in pixels.tolist()]
     for tip, color in zip(tips, ((255, 40, 40), (40, 220, 40), (60, 90, 255)), strict=True):
         draw.line([origin, tip], fill=color, width=width)
+    return from_pil(picture).to(image)
+
+
+def draw_instances(image: Tensor, masks: Sequence[Tensor], labels: Sequence[str], width: int = 2) -> Tensor:
+    """Draw the outlines of instances, each in a colour of its own, with labels.
+
+    Args:
+        image: (3, H, W) in [0, 1].
+        masks: (H, W) bool each.
+        labels: what stands at each outline.
+        width: of an outline in pixels.
+
+    Returns:
+        A new (3, H, W) image.
+    """
+    colors = [hsv_to_rgb(i / max(len(masks), 1), 0.85, 1.0) for i in range(len(masks))]
+    for mask, color in zip(masks, colors, strict=True):
+        image = draw_contour(image, mask.to(image.device), color, width)
+    picture = to_pil(image)
+    draw = ImageDraw.Draw(picture)
+    for mask, color, label in zip(masks, colors, labels, strict=True):
+        rows, columns = mask.nonzero(as_tuple=True)
+        if not len(rows):
+            continue
+        at = (int(columns.min()), max(0, int(rows.min()) - 13))
+        draw.rectangle(draw.textbbox(at, label), fill=(0, 0, 0))
+        draw.text(at, label, fill=tuple(round(255 * x) for x in color))
     return from_pil(picture).to(image)
 
 
