@@ -123,10 +123,14 @@ class SamProposer(Proposer):
             larger = (logits > -self.margin).flatten(1).sum(1)
             stability = (logits > self.margin).flatten(1).sum(1) / larger.clamp_min(1)
             good = (quality >= self.min_quality) & (stability >= self.min_stability)
+            if not bool(good.any()):
+                continue
             mask = _to_picture(logits[good], inside, (height, width))
             large = mask.flatten(1).sum(1) >= self.min_pixels
             kept.append(mask[large])
             qualities.append(quality[good][large])
+        if not kept:
+            return image.new_zeros(0, height, width, dtype=torch.bool), image.new_zeros(0)
         masks, quality = torch.cat(kept), torch.cat(qualities).clamp(0, 1)
         best = suppress(mask_overlaps(masks), quality, self.overlap)[: self.max_proposals]
         return masks[best], quality[best]
