@@ -1,5 +1,6 @@
-"""Estimate poses in one picture of your own, or in the pictures of a BOP dataset.
+"""Estimate poses in pictures of your own, or in those of a BOP dataset. Without a mask, objects are found first.
 
+python experiments/estimate.py image=photo.jpg meshes=[cup.ply,box.ply] intrinsics=[fx,fy,cx,cy]
 python experiments/estimate.py image=photo.jpg mesh=cup.ply mask=mask.png intrinsics=[fx,fy,cx,cy]
 python experiments/estimate.py data=lmo data.root=/path/to/lmo masks=gt extractor=dense_sift
 """
@@ -51,7 +52,12 @@ def main(cfg: DictConfig) -> None:
     """Estimate and write JSON, BOP CSV and overlays to the run's folder."""
     output = Path(HydraConfig.get().runtime.output_dir)
     with clear_errors():
-        if cfg.image is not None:
+        if cfg.image is not None and cfg.mask is None and cfg.box is None:
+            from finding import find_in_pictures  # which reads views with what is below
+
+            if not find_in_pictures(cfg, output):
+                sys.exit(1)
+        elif cfg.image is not None:
             estimate_picture(cfg, output)
         else:
             estimate_dataset(cfg, output)
@@ -139,6 +145,18 @@ def numbers(cfg: DictConfig, name: str, form: str, count: int | None = None) -> 
     if not right or count not in (None, len(value)):
         raise ValueError(f"{name} must be {form}, got {value}")
     return [float(v) for v in value]
+
+
+def numbers_of_instances(cfg: DictConfig, meshes: int) -> int | list[int] | None:
+    """How many instances of each mesh a picture has at most; None for as many as there are."""
+    value = list(cfg.instances) if OmegaConf.is_list(cfg.instances) else cfg.instances
+    counts = value if isinstance(value, list) else [1 if value is None else value]
+    right = all(type(count) is int and count >= 1 for count in counts)
+    if not right or (isinstance(value, list) and len(value) != meshes):
+        raise ValueError(
+            f"instances must be a number of at least 1, one for each of the {meshes} meshes, or null; got {value}"
+        )
+    return value
 
 
 def undistort(image: Tensor, mask: Tensor, K: Tensor, distortion: list[float]) -> tuple[Tensor, Tensor]:

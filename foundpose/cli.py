@@ -9,7 +9,7 @@ from pathlib import Path
 
 from foundpose.config import apps_folder
 
-HIDDEN = {"scenes"}  # modules beside the apps
+HIDDEN = {"finding", "scenes"}  # modules beside the apps
 EXTRAS = {  # what an installation may lack, and the extra that brings it
     **dict.fromkeys(("pytorch_lightning", "pandas", "plotly", "jinja2", "matplotlib"), "evaluate"),
     **dict.fromkeys(("cv2", "faiss", "sklearn"), "benchmark"),

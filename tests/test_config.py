@@ -12,8 +12,10 @@ from omegaconf import OmegaConf
 from pytorch_lightning.strategies import DDPStrategy
 
 from foundpose.bop import BopDataset
-from foundpose.config import build_method, claim_run_folder
+from foundpose.config import build_detector, build_method, claim_run_folder
+from foundpose.detection import Proposer, RegionProposer
 from foundpose.features import DenseSift, PatchExtractor
+from foundpose.pipeline import DetectAndEstimate
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 GROUPS = sorted(
@@ -44,6 +46,13 @@ SMALL = {
     "loftr": [],
     "s2dnet": [],
 }
+SMALL_SAM = [
+    "proposer.variant=sam_vitb",
+    "proposer.weights=random",
+    "proposer.seed=0",
+    "proposer.config={vision_config: {num_hidden_layers: 1, hidden_size: 24, num_attention_heads: 2, "
+    "global_attn_indexes: []}}",
+]
 SMALL_MEGAPOSE = ["megapose.weights=random", "megapose.seed=0", "megapose.width=4"]
 
 
@@ -112,6 +121,14 @@ def test_every_option_is_instantiated(group, option, tiny_bop, monkeypatch):
         assert instantiate(cfg[group]) is not None
     elif group == "data":
         assert isinstance(instantiate(cfg.data), BopDataset)
+    elif group == "proposer":
+        if option == "file":
+            path = tiny_bop / "detections" / "cnos-fastsam" / "detections.json"
+            cfg = load("config", "proposer=file", f"proposer.path={path}")
+        small = [*overrides, *SMALL_SAM] if option == "sam" else []
+        assert isinstance(instantiate((load("config", *small) if small else cfg).proposer), Proposer)
+    elif group == "masks" and option == "detect":
+        assert cfg.masks.path is None  # found first
     elif group == "masks":
         cfg.data.root = str(tiny_bop)
         assert len(instantiate(cfg.masks)(BopDataset(tiny_bop))) == 3
@@ -124,6 +141,17 @@ def test_nodes_of_the_default_are_instantiated(name):
     node = load()[name]
     assert instantiate(node) is not None
     same_as_constructor(node, {"background"}, defaults=True)
+
+
+def test_the_detector_has_its_constructors_keys():
+    cfg = load("config", "extractor=dense_sift")
+    for name, given in (("detector", {"extractor"}), ("finder", {"detector", "pipeline"})):
+        node = OmegaConf.create(OmegaConf.to_container(cfg[name], resolve=True) | dict.fromkeys(given))
+        same_as_constructor(node, given | {"preselection", "dense"}, defaults=True)
+    detector = build_detector(cfg, instantiate(cfg.extractor))
+    assert isinstance(detector.proposer, RegionProposer)
+    finder = instantiate(cfg.finder, detector=detector, pipeline=build_method(cfg).pipeline)
+    assert isinstance(finder, DetectAndEstimate)
 
 
 def test_queries_are_corrupted_and_templates_are_not():
@@ -187,7 +215,9 @@ DELIBERATE = {
 }
 
 
-@pytest.mark.parametrize(("group", "option"), [g for g in GROUPS if g[0] in {*MODULES, "extractor"}])
+@pytest.mark.parametrize(
+    ("group", "option"), [g for g in GROUPS if g[0] in {*MODULES, "extractor", "proposer"}]
+)
 def test_config_and_constructor_have_the_same_keys_and_defaults(group, option):
     cfg = load("config", f"{group}={option}")[group]
     same_as_constructor(cfg, DELIBERATE.get((group, option), set()), defaults=group != "extractor")

@@ -131,7 +131,11 @@ def test_own_picture_with_mask_box_and_distortion(own_picture, monkeypatch, tmp_
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ([], "give either mask=… (a picture) or box=[x,y,width,height]"),
+        (["mask=a.png", "box=[1,2,3,4]"], "give either mask=… (a picture) or box=[x,y,width,height]"),
+        (["meshes=[cup.ply]"], "give either mesh=cup.ply or meshes=[cup.ply,box.ply], not both"),
+        (["instances=0"], "instances must be a number of at least 1"),
+        (["instances=[1,2]"], "one for each of the 1 meshes"),
+        (["step=0"], "step must be a whole number of at least 1, got 0"),
         (["mask=none.png"], "no image at none.png"),
         (["box=[1,2,3]"], "box must be [x,y,width,height], got [1, 2, 3]"),
         (["intrinsics=null", "box=[1,2,3,4]"], "give intrinsics=… too"),
@@ -320,3 +324,82 @@ def test_onboard_skips_what_is_there(tiny_bop, monkeypatch, tmp_path, capsys):
     with pytest.raises(SystemExit):
         run_app(monkeypatch, "onboard", *arguments, "mesh=none.ply")
     assert "error: " in capsys.readouterr().err
+
+
+def test_objects_are_found_in_a_folder_and_a_video(own_picture, monkeypatch, tmp_path, capsys):
+    """Without a mask: in pictures of a folder, of which one shows nothing, and in every second frame of a video."""
+    folder, scene, _, (image, _, *arguments) = own_picture
+    pictures = tmp_path / "pictures"
+    pictures.mkdir()
+    shutil.copy(image.removeprefix("image="), pictures / "a.png")
+    Image.new("RGB", (640, 480), (90, 90, 90)).save(pictures / "b.png")
+    few = ["detector.candidates=8", "detector.max_detections=2", "detector.dense.scale=1"]
+    arguments = [*arguments, *few, f"meshes=[{folder / 'cup.ply'}]"]
+    run = [*arguments, f"image={pictures}", f"hydra.run.dir={tmp_path / 'run'}"]
+    run_app_on_one_thread("estimate", *run)
+    entries = json.loads((tmp_path / "run" / "estimates.json").read_text())
+    (best,) = [entry for entry in entries if entry["picture"] == "a"]
+    center = torch.tensor(best["t"]) / best["t"][2]
+    u, v = (scene.K @ center.float())[:2].tolist()
+    assert bool(scene.mask[round(v), round(u)])  # it is where the object is
+    drawn = np.asarray(Image.open(tmp_path / "run" / "overlays" / "a.png")).astype(int)
+    assert np.abs(drawn - np.asarray(Image.open(pictures / "a.png"))).sum() > 10_000
+    assert len(read_results(tmp_path / "run" / "results.csv")) == len(entries)
+
+    # What is done is not repeated.
+    before = (tmp_path / "run" / "pictures" / "a.json").stat().st_mtime_ns
+    run_app_on_one_thread("estimate", *run)
+    assert (tmp_path / "run" / "pictures" / "a.json").stat().st_mtime_ns == before
+
+    film = cv2.VideoWriter(str(tmp_path / "film.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 10, (160, 120))
+    for _ in range(3):
+        film.write(np.full((120, 160, 3), 90, np.uint8))
+    film.release()
+    with pytest.raises(SystemExit) as ended:  # nothing is in it
+        run_app_on_one_thread(
+            "estimate",
+            *arguments,
+            f"image={tmp_path / 'film.avi'}",
+            "intrinsics=[150,150,80,60]",
+            "step=2",
+            "proposer.min_patches=10000",
+            f"hydra.run.dir={tmp_path / 'film'}",
+        )
+    assert ended.value.code == 1
+    assert sorted(p.name for p in (tmp_path / "film" / "pictures").iterdir()) == [
+        "film_000000.json",
+        "film_000002.json",
+    ]
+    assert "not found: " in capsys.readouterr().err
+
+
+def test_detect_and_evaluate_what_was_found(left_alone, tiny_bop, monkeypatch, tmp_path, capsys):
+    """From pictures to scores, where the regions are those of a file that does not say what they show."""
+    proposals = tiny_bop / "detections" / "cnos-fastsam" / "detections.json"
+    arguments = [
+        *(a for a in bop_arguments(tiny_bop, left_alone) if not a.startswith(("masks", "overlays"))),
+        "proposer=file",
+        f"proposer.path={proposals}",
+    ]
+    run_app(monkeypatch, "detect", *arguments, f"hydra.run.dir={tmp_path / 'detect'}")
+    scores = json.loads((tmp_path / "detect" / "detection_scores.json").read_text())
+    # The objects have the same codes of coordinates, so each is also found where only the other is.
+    assert scores["segm"]["AP"] > 0.6
+    assert len(list((tmp_path / "detect" / "overlays").iterdir())) == 3
+    assert "AP_segm" in capsys.readouterr().out
+
+    run_app(
+        monkeypatch,
+        "evaluate",
+        *arguments,
+        "masks=detect",
+        "errors=[mspd]",
+        f"hydra.run.dir={tmp_path / 'run'}",
+    )
+    records = json.loads((tmp_path / "run" / "estimates.json").read_text())
+    assert {(r["im_id"], r["obj_id"]) for r in records if r["valid"]} >= {(0, 1), (1, 2), (2, 1)}
+    found = json.loads((tmp_path / "run" / "detections.json").read_text())
+    assert sorted(e["score"] for e in found) == pytest.approx(
+        sorted(e["score"] for e in json.loads((tmp_path / "detect" / "detections.json").read_text()))
+    )
+    assert json.loads((tmp_path / "run" / "scores.json").read_text())["AR_MSPD"] > 0.6

@@ -11,6 +11,7 @@ from omegaconf import OmegaConf
 from PIL import Image
 
 import estimate
+import finding
 from foundpose.synthetic import procedural_mesh
 from tests.bop_dataset import write_ply
 
@@ -74,6 +75,35 @@ def test_any_value_is_used_or_refused_in_one_line(folder, changed):
         patch.setattr(estimate, "claim_run_folder", lambda *_: None)
         with pytest.raises((SystemExit, AcceptedError)) as ended, estimate.clear_errors():
             estimate.estimate_picture(picture, folder)
+    if isinstance(ended.value, SystemExit):
+        assert ended.value.code == 2
+        (line,) = [line for line in told.getvalue().splitlines() if line.startswith("error: ")]
+        assert len(line) > 20
+    assert "Traceback" not in told.getvalue()
+
+
+FINDING = {
+    **{key: value for key, value in RIGHT.items() if key not in ("mask", "mesh")},
+    "mask": None,
+    "mesh": None,
+    "meshes": ["{}/mesh.ply"],
+    "instances": 1,
+    "step": 1,
+}
+
+
+@settings(max_examples=150)
+@given(changed=st.dictionaries(st.sampled_from(sorted({*FINDING} - {"mask", "box"})), VALUES, max_size=3))
+@example(changed={"meshes": ["{}/mesh.ply", "{}/mesh.ply"]})
+@example(changed={"instances": [1, 2]})
+def test_any_value_is_used_or_refused_where_objects_are_found(folder, changed):
+    values = {key: _with_folder(value, folder) for key, value in (FINDING | changed).items()}
+    told = io.StringIO()
+    with contextlib.redirect_stderr(told), pytest.MonkeyPatch.context() as patch:
+        patch.setattr(finding, "build_method", _accepted)
+        patch.setattr(finding, "claim_run_folder", lambda *_: None)
+        with pytest.raises((SystemExit, AcceptedError)) as ended, estimate.clear_errors():
+            finding.find_in_pictures(OmegaConf.create(values), folder)
     if isinstance(ended.value, SystemExit):
         assert ended.value.code == 2
         (line,) = [line for line in told.getvalue().splitlines() if line.startswith("error: ")]
