@@ -11,7 +11,7 @@ from foundpose.config import apps_folder
 
 HIDDEN = {"finding", "scenes"}  # modules beside the apps
 EXTRAS = {  # what an installation may lack, and the extra that brings it
-    **dict.fromkeys(("pytorch_lightning", "pandas", "plotly", "jinja2", "matplotlib"), "evaluate"),
+    **dict.fromkeys(("pytorch_lightning", "pandas", "plotly", "matplotlib"), "evaluate"),
     **dict.fromkeys(("cv2", "faiss", "sklearn"), "benchmark"),
 }
 

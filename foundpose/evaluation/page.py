@@ -3,9 +3,8 @@
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import plotly.graph_objects as go
 import torch
 from PIL import Image
 from torch import Tensor
@@ -19,6 +18,9 @@ from foundpose.pipeline.figure import ObjectView
 from foundpose.utils.progress import ProgressBars
 from foundpose.visualization.overlay import REFINED, TRUTH, Color, draw_contour, from_pil, to_pil
 from foundpose.visualization.report import Cell, Report, lines_chart, stacked_bars, write_report
+
+if TYPE_CHECKING:
+    import plotly.graph_objects as go
 
 _THUMBNAIL = 96  # pixels
 _ROOM = 1.6  # of a thumbnail around the mask
@@ -36,6 +38,8 @@ class EvaluationReport:
     def __init__(self, figures: int = 40, thumbnails: int = 1000) -> None:
         if min(figures, thumbnails) < 0:
             raise ValueError(f"figures and thumbnails must not be negative, got {figures} and {thumbnails}")
+        import plotly  # noqa: F401  # if it is missing, that is found before the work
+
         self.figures = figures
         self.thumbnails = thumbnails
 
@@ -207,7 +211,7 @@ def recall_table(scores: Scores, dataset: BopDataset) -> list[dict[str, Cell]]:
     return rows
 
 
-def recall_charts(scores: Scores, dataset: BopDataset) -> dict[str, go.Figure]:
+def recall_charts(scores: Scores, dataset: BopDataset) -> "dict[str, go.Figure]":
     """Recall against the threshold under each error, of all objects together and of each."""
     charts = {}
     for name, found in scores.functions.items():
@@ -223,7 +227,7 @@ def recall_charts(scores: Scores, dataset: BopDataset) -> dict[str, go.Figure]:
     return charts
 
 
-def _reasons_chart(cases: Sequence[Mapping[str, Cell]]) -> go.Figure:
+def _reasons_chart(cases: Sequence[Mapping[str, Cell]]) -> "go.Figure":
     objects = sorted({str(case["object"]) for case in cases})
     counts = Counter((str(case["reason"]), str(case["object"])) for case in cases)
     reasons = sorted({reason for reason, _ in counts}, key=lambda reason: (reason != "right", reason))

@@ -4,14 +4,15 @@ import base64
 from collections.abc import Mapping, Sequence
 from io import BytesIO
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-import plotly.graph_objects as go
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from PIL import Image
-from plotly.offline import get_plotlyjs
 
 from foundpose.utils.files import write_text
+
+if TYPE_CHECKING:  # pages without charts do without plotly
+    import plotly.graph_objects as go
 
 Cell = str | float | int | None
 
@@ -32,7 +33,7 @@ class Report(NamedTuple):
     title: str
     facts: Mapping[str, str]
     tables: Mapping[str, Sequence[Mapping[str, Cell]]]
-    charts: Mapping[str, go.Figure]
+    charts: "Mapping[str, go.Figure]"
     cases: Sequence[Mapping[str, Cell]]
     thumbnails: Mapping[int, Image.Image]
     figures: Mapping[int, Image.Image]
@@ -72,13 +73,15 @@ def write_report(path: str | Path, report: Report) -> None:
         tables=report.tables,
         charts=charts,
         cases=cases,
-        plotly=get_plotlyjs() if charts else "",
+        plotly=_plotly_code() if charts else "",
     )
     write_text(Path(path), page)
 
 
-def lines_chart(x: Sequence[float], lines: Mapping[str, Sequence[float]], x_title: str) -> go.Figure:
+def lines_chart(x: Sequence[float], lines: Mapping[str, Sequence[float]], x_title: str) -> "go.Figure":
     """Lines over the same values, the first one thick; shares of 1 on the y axis."""
+    import plotly.graph_objects as go
+
     figure = go.Figure(layout=_layout(x_title))
     for number, (name, y) in enumerate(lines.items()):
         width = 4 if number == 0 else 1.5
@@ -87,8 +90,10 @@ def lines_chart(x: Sequence[float], lines: Mapping[str, Sequence[float]], x_titl
     return figure
 
 
-def stacked_bars(counts: Mapping[str, Mapping[str, int]], x_title: str) -> go.Figure:
+def stacked_bars(counts: Mapping[str, Mapping[str, int]], x_title: str) -> "go.Figure":
     """Counts by kind (a colour each) and by place on the x axis, on top of each other."""
+    import plotly.graph_objects as go
+
     figure = go.Figure(layout=_layout(x_title))
     for kind, by_place in counts.items():
         figure.add_bar(x=list(by_place), y=list(by_place.values()), name=kind)
@@ -104,6 +109,13 @@ def _layout(x_title: str) -> dict[str, object]:
         "margin": {"l": 50, "r": 10, "t": 10, "b": 45},
         "xaxis": {"title": x_title},
     }
+
+
+def _plotly_code() -> str:
+    from plotly.offline import get_plotlyjs
+
+    code: str = get_plotlyjs()
+    return code
 
 
 def _data_uri(picture: Image.Image) -> str:
