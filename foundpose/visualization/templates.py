@@ -20,8 +20,8 @@ from foundpose.representation import ObjectRepresentation
 from foundpose.visualization.overlay import to_pil
 from foundpose.visualization.tiles import captioned, draw_patches, principal_colors, side_by_side, stacked
 
-_MOST_POINTS = 300_000
-_CELLS = 100  # along a diameter
+_MOST_POINTS = 120_000
+_CELLS = 30  # along a diameter
 
 
 class TemplateViewer:
@@ -118,12 +118,12 @@ class TemplateViewer:
         """Points (n, 3) of the surface and their colours (n, 3), the means of what all templates say of a place."""
         points = self.representation.points_model.float()
         rows = torch.arange(0, len(points), max(1, len(points) // _MOST_POINTS))
-        found = torch.cat([points[rows], self.representation.read_descriptors(rows, 3).float()], dim=1)
-        cells = (found[:, :3] * (_CELLS / self.representation.info.diameter)).round().long()
+        descriptors = self.representation.read_descriptors(rows, 3).float()
+        cells = (points[rows] * (_CELLS / self.representation.info.diameter)).round().long()
         _, cell = cells.unique(dim=0, return_inverse=True)
         count = torch.bincount(cell)
-        means = found.new_zeros(len(count), found.shape[1]).index_add(0, cell, found) / count[:, None]
-        return means[:, :3], principal_colors(means[:, 3:])[0]
+        means = descriptors.new_zeros(len(count), descriptors.shape[1]).index_add(0, cell, descriptors)
+        return points[rows], principal_colors(means / count[:, None])[0][cell]
 
     def _tile(self, index: int, caption: str) -> Image.Image:
         pictures = [p for p in (self.picture(index), self.words(index)) if p is not None]
