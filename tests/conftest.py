@@ -8,7 +8,7 @@ from hypothesis import HealthCheck, settings
 
 from foundpose.features import CoordinateCode, PcaProjection
 from foundpose.geometry import SuperFibonacci
-from foundpose.onboarding import Onboarder
+from foundpose.onboarding import Onboarder, RepresentationStore
 from foundpose.rendering import CoordinateRenderer, Mesh
 from foundpose.representation import ObjectRepresentation
 from foundpose.retrieval import SoftAssignBow, VisualWords
@@ -23,6 +23,20 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 # How long an example takes says how busy the machine is.
 settings.register_profile("foundpose", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("foundpose")
+
+
+# What takes longest comes first, so that no process is left with a long file when the others have nothing to do.
+LONG = ("experiments", "evaluation", "training", "test_kills.py", "pipeline", "onboarding", "features", "pnp")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Order files by how long they take, roughly."""
+
+    def rank(item: pytest.Item) -> int:
+        room = item.path.relative_to(Path(__file__).parent).parts[0]
+        return LONG.index(room) if room in LONG else len(LONG)
+
+    items.sort(key=rank)
 
 
 @pytest.fixture(autouse=True)
@@ -77,6 +91,27 @@ def oracle_onboarder() -> Onboarder:
 
 
 @pytest.fixture(scope="session")
-def oracle_blob(blob: Mesh, oracle_onboarder: Onboarder) -> ObjectRepresentation:
+def representations(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of objects that all test processes share: whoever needs one first onboards it."""
+    folder = tmp_path_factory.getbasetemp()
+    return (folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder) / "representations"
+
+
+@pytest.fixture(scope="session")
+def oracle_blob(blob: Mesh, oracle_onboarder: Onboarder, representations: Path) -> ObjectRepresentation:
     """Representation of the blob under the oracle."""
-    return oracle_onboarder(blob, "blob")
+    return RepresentationStore(representations, oracle_onboarder).get(blob, "blob")
+
+
+@pytest.fixture(scope="session")
+def other_mesh() -> Mesh:
+    """A procedural mesh of 2.5 k vertices."""
+    return procedural_mesh(8, subdivisions=4)
+
+
+@pytest.fixture(scope="session")
+def oracle_other(
+    other_mesh: Mesh, oracle_onboarder: Onboarder, representations: Path
+) -> ObjectRepresentation:
+    """Its representation under the oracle."""
+    return RepresentationStore(representations, oracle_onboarder).get(other_mesh, "other")

@@ -1,6 +1,7 @@
-"""What `tests/test_kills.py` runs in processes of their own and kills."""
+"""What tests run in processes of their own and kill."""
 
 import hashlib
+import os
 import runpy
 import sys
 from pathlib import Path
@@ -25,10 +26,26 @@ _SMALL = ["viewpoints.count=20", "words.num_words=32", "crop.size=140", "project
 
 def run_job(name, folder, root, ready):
     """Do a job; ``ready`` is set when what is worth killing begins."""
-    torch.set_num_threads(1)
-    sys.stdout = sys.stderr = (folder.parent / f"{folder.name}.log").open("w")
+    _alone(folder.parent / f"{folder.name}.log")
     ready.set()
     JOBS[name](folder, root)
+
+
+def run_app(name, arguments, log):
+    """Run an app as the command line would, on one thread; what it and its own processes print goes to ``log``."""
+    _alone(log)
+    # Processes that it starts run the same file.
+    sys.argv = [str(EXPERIMENTS / f"{name}.py"), *arguments]
+    runpy.run_path(sys.argv[0], run_name="__main__")
+
+
+def _alone(log):
+    torch.set_num_threads(1)
+    os.environ["OMP_NUM_THREADS"] = "1"
+    file = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    for stream in (1, 2):
+        os.dup2(file, stream)
+    sys.stdout, sys.stderr = os.fdopen(1, "w"), os.fdopen(2, "w")
 
 
 def onboard(folder, _):

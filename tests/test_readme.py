@@ -16,15 +16,16 @@ def test_the_python_example_runs(tmp_path, monkeypatch, capsys):
     statements = [line for line in code.splitlines() if line and not line.startswith(("import", "from"))]
     assert len(statements) <= 10
     mesh = procedural_mesh(1, subdivisions=5)
-    scene = cluttered_scene(mesh, seed=51)
+    scene = cluttered_scene(mesh, seed=1076)  # taken from near a template
     write_ply(tmp_path / "cup.ply", mesh)
     Image.fromarray((scene.image * 255).round().byte().permute(1, 2, 0).numpy()).save(tmp_path / "photo.png")
     Image.fromarray(scene.mask.numpy()).save(tmp_path / "mask.png")
-    # Fewer templates and words, and this picture's camera; all else as it stands there.
+    # Fewer and smaller templates, fewer words, and this picture's camera; all else as it stands there.
     K = scene.K
     for old, new in {
-        "SuperFibonacci(800)": "SuperFibonacci(100)",
-        "VisualWords(2048)": "VisualWords(1024)",
+        "SuperFibonacci(800)": "SuperFibonacci(60)",
+        "VisualWords(2048), bow": "VisualWords(512), bow, image_size=280",
+        "PerspectiveCrop()": "PerspectiveCrop(280)",
         "(600, 600, 319.5, 239.5)": f"({K[0, 0]}, {K[1, 1]}, {K[0, 2]}, {K[1, 2]})",
     }.items():
         assert old in code

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from scipy import ndimage
 from torch import Tensor
 
 from foundpose.utils.pictures import PictureError, check_size, read_picture
@@ -55,6 +54,8 @@ def read_mask(
 
 def largest_component(mask: Tensor) -> Tensor:
     """The largest piece of a mask (H, W) bool; pixels that touch at a corner belong together."""
+    from scipy import ndimage  # slow to import, and few masks need it
+
     box = _box(mask)
     inside = mask[box].cpu().numpy()
     pieces, count = ndimage.label(inside, structure=np.ones((3, 3)))

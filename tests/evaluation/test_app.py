@@ -1,12 +1,7 @@
 import csv
 import json
-import os
 import re
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -14,7 +9,8 @@ import pytest
 from foundpose.bop import check_times, read_results
 from foundpose.evaluation.shards import shard_path
 from tests.bop_dataset import make_bop_dataset
-from tests.experiments.test_apps import SMALL, run_app, run_app_on_one_thread
+from tests.experiments.test_apps import SMALL, run_app
+from tests.processes import finish, kill_when, start_app
 
 ROOT = Path(__file__).resolve().parents[2]
 NUM_IMAGES = 6
@@ -24,11 +20,6 @@ NAME = "oracle_tiny-test.csv"
 @pytest.fixture(scope="module")
 def root(tmp_path_factory):
     return make_bop_dataset(tmp_path_factory.mktemp("evaluation") / "tiny", images=NUM_IMAGES)
-
-
-@pytest.fixture(scope="module")
-def representations(tmp_path_factory):
-    return tmp_path_factory.mktemp("representations")
 
 
 @pytest.fixture(scope="module")
@@ -49,26 +40,9 @@ def reference(arguments, tmp_path_factory):
     """A run left alone, of one process."""
     folder = tmp_path_factory.mktemp("reference")
     wanted = [argument for argument in arguments if argument != "report=null"]
-    run_app_on_one_thread("evaluate", *wanted, "report.figures=2", f"hydra.run.dir={folder}")
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        run_app(monkeypatch, "evaluate", *wanted, "report.figures=2", f"hydra.run.dir={folder}")
     return folder
-
-
-def command(arguments, folder):
-    return [
-        sys.executable,
-        str(ROOT / "experiments" / "evaluate.py"),
-        *arguments,
-        f"hydra.run.dir={folder}",
-    ]
-
-
-ENVIRONMENT = os.environ | {"OMP_NUM_THREADS": "1"}
-
-
-def start(arguments, folder):
-    return subprocess.run(
-        command(arguments, folder), env=ENVIRONMENT, capture_output=True, text=True, timeout=900
-    )
 
 
 def rows_without_times(path):
@@ -111,8 +85,9 @@ def test_a_run_from_detections_to_scores(reference):
 
 def test_two_processes_share_the_work_and_agree_on_a_size(arguments, reference, tmp_path):
     """No instance is lost or done twice, and the results are those of one process."""
-    run = start([*arguments, "data_module.batch_size=auto", "trainer=ddp", "trainer.devices=2"], tmp_path)
-    assert run.returncode == 0, run.stderr[-2000:]
+    changes = ["data_module.batch_size=auto", "trainer=ddp", "trainer.devices=2"]
+    log = tmp_path / "log"
+    printed = finish(start_app("evaluate", [*arguments, *changes, f"hydra.run.dir={tmp_path}"], log), log)
     size = json.loads((tmp_path / "batch_size.json").read_text())["batch_size"]
     assert size in (1, 2)  # every process gets a batch
     numbers = [
@@ -123,30 +98,27 @@ def test_two_processes_share_the_work_and_agree_on_a_size(arguments, reference, 
     assert numbers == [batches[::2], batches[1::2]]
     assert rows_without_times(tmp_path / NAME) == rows_without_times(reference / NAME)
     # One process wrote the results and printed the table.
-    assert run.stdout.count("AR_MSPD") == 1
+    assert printed.count("AR_MSPD") == 1
     scores = [json.loads((folder / "scores.json").read_text()) for folder in (tmp_path, reference)]
     assert scores[0]["mspd"] == scores[1]["mspd"]
 
 
 def test_a_killed_run_goes_on(arguments, reference, root, tmp_path):
     """Kill it as soon as batches are there, twice; the end is that of the run left alone."""
-    shard = shard_path(tmp_path, 0)
+    shard, log = shard_path(tmp_path, 0), tmp_path / "log"
+    arguments = [*arguments, f"hydra.run.dir={tmp_path}"]
+
+    def batches_done():
+        return shard.read_bytes().count(b"\n") if shard.is_file() else 0
+
     for batches in (1, 2):
-        process = subprocess.Popen(command(arguments, tmp_path), env=ENVIRONMENT, stderr=subprocess.DEVNULL)
-        deadline = time.monotonic() + 600  # on a busy machine
-        while not shard.is_file() or shard.read_bytes().count(b"\n") < batches:
-            assert process.poll() is None, "the run ended before it could be killed"
-            assert time.monotonic() < deadline
-            time.sleep(0.002)
-        process.send_signal(signal.SIGKILL)
-        process.wait()
+        kill_when(start_app("evaluate", arguments, log), lambda batches=batches: batches_done() >= batches)
         assert not (tmp_path / NAME).exists()
     # A line that the kill cut short.
     shard.write_bytes(shard.read_bytes() + b'{"number": 2, "rec')
     before = shard.read_bytes().splitlines()[:2]
     # The rest may be done by more processes.
-    run = start([*arguments, "trainer=ddp", "trainer.devices=2"], tmp_path)
-    assert run.returncode == 0, run.stderr[-2000:]
+    finish(start_app("evaluate", [*arguments, "trainer=ddp", "trainer.devices=2"], log), log)
     assert shard.read_bytes().splitlines()[:2] == before
     # A process for which nothing was left has no shard.
     lines = [line for path in shard.parent.glob("rank-*.jsonl") for line in path.read_text().splitlines()]

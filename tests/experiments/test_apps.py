@@ -1,12 +1,8 @@
 import json
-import os
 import re
 import runpy
 import shutil
-import signal
-import subprocess
 import sys
-import time
 from pathlib import Path
 
 import cv2
@@ -19,6 +15,7 @@ from foundpose.bop import BopDataset, read_results
 from foundpose.geometry import rotation_angle
 from foundpose.synthetic import cluttered_scene, procedural_mesh
 from tests.bop_dataset import write_ply
+from tests.processes import finish, kill_when, start_app
 
 ROOT = Path(__file__).resolve().parents[2]
 # Small, but everything is in it.
@@ -26,19 +23,13 @@ SMALL = ["viewpoints.count=60", "words.num_words=128", "projection.num_component
 
 
 def run_app(monkeypatch, name, *overrides):
-    """Run an app in this process as the command line would."""
+    """Run an app in this process as the command line would, with the rounding of one that has a single thread."""
     monkeypatch.setattr(sys, "argv", [f"{name}.py", *overrides])
     monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
-    runpy.run_path(str(ROOT / "experiments" / f"{name}.py"), run_name="__main__")
-
-
-def run_app_on_one_thread(name, *overrides):
-    """Run an app in this process, with the rounding of one that has a single thread."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        with pytest.MonkeyPatch.context() as monkeypatch:
-            run_app(monkeypatch, name, *overrides)
+        runpy.run_path(str(ROOT / "experiments" / f"{name}.py"), run_name="__main__")
     finally:
         torch.set_num_threads(threads)
 
@@ -205,29 +196,31 @@ def test_a_picture_without_a_pose_is_a_failure(own_picture, monkeypatch, tmp_pat
     assert read_results(tmp_path / "results.csv") == []
 
 
-def bop_arguments(root, folder):
+def bop_arguments(root, representations):
     return [
         "experiment=oracle",
         f"data.root={root}",
         *SMALL,
-        f"representations={folder / 'representations'}",
+        f"representations={representations}",
         "overlays=3",
         "masks=cnos",
     ]
 
 
 @pytest.fixture(scope="module")
-def left_alone(tiny_bop, tmp_path_factory):
-    """A folder with the onboarded objects, and in ``run`` what nobody interrupted."""
+def left_alone(tiny_bop, representations, tmp_path_factory):
+    """Folder of a run that nobody interrupted."""
     folder = tmp_path_factory.mktemp("alone")
-    run_app_on_one_thread("estimate", *bop_arguments(tiny_bop, folder), f"hydra.run.dir={folder / 'run'}")
+    arguments = [*bop_arguments(tiny_bop, representations), f"hydra.run.dir={folder}"]
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        run_app(monkeypatch, "estimate", *arguments)
     return folder
 
 
-def test_bop_dataset_with_both_kinds_of_masks(tiny_bop, left_alone, monkeypatch, tmp_path):
-    arguments = bop_arguments(tiny_bop, left_alone)
+def test_bop_dataset_with_both_kinds_of_masks(tiny_bop, left_alone, representations, monkeypatch, tmp_path):
+    arguments = bop_arguments(tiny_bop, representations)
     run_app(monkeypatch, "estimate", *arguments, "masks=gt", f"hydra.run.dir={tmp_path}")
-    for masks, output in (("gt", tmp_path), ("cnos", left_alone / "run")):
+    for masks, output in (("gt", tmp_path), ("cnos", left_alone)):
         results = read_results(output / "oracle_tiny-test.csv")
         assert [(r.scene_id, r.im_id, r.obj_id) for r in results] == [(1, 0, 1), (1, 1, 2), (1, 2, 1)]
         dataset = BopDataset(tiny_bop)
@@ -239,9 +232,9 @@ def test_bop_dataset_with_both_kinds_of_masks(tiny_bop, left_alone, monkeypatch,
         assert [p.name for p in (output / "overlays").iterdir()] == ["000001_000000_000001_0.png"]
 
 
-def test_a_run_is_resumed_and_guarded(tiny_bop, left_alone, monkeypatch, tmp_path, capsys):
+def test_a_run_is_resumed_and_guarded(tiny_bop, representations, monkeypatch, tmp_path, capsys):
     output = tmp_path / "run"
-    arguments = [*bop_arguments(tiny_bop, left_alone), f"hydra.run.dir={output}"]
+    arguments = [*bop_arguments(tiny_bop, representations), f"hydra.run.dir={output}"]
     run_app(monkeypatch, "estimate", *arguments, "max_images=2")
     shards = sorted((output / "images").iterdir())
     assert len(shards) == 2
@@ -258,7 +251,7 @@ def test_meshes_in_another_unit_and_unknown_objects_are_refused(tiny_bop, monkey
     root = shutil.copytree(tiny_bop, tmp_path / "data")
     info = {str(i): {"diameter": 0.12} for i in (1, 2)}
     (root / "models" / "models_info.json").write_text(json.dumps(info))
-    arguments = [*bop_arguments(root, tmp_path), f"hydra.run.dir={tmp_path / 'run'}"]
+    arguments = [*bop_arguments(root, tmp_path / "representations"), f"hydra.run.dir={tmp_path / 'run'}"]
     for change, message in (
         ([], "are they in the same unit?"),
         (["objects=[7]"], "objects must be a list of ids from [1, 2]"),
@@ -273,31 +266,18 @@ def test_meshes_in_another_unit_and_unknown_objects_are_refused(tiny_bop, monkey
 
 def test_killed_onboarding_and_estimation_lose_nothing(tiny_bop, left_alone, tmp_path):
     """Kill the process at its first written file, start it again, and compare with a run left alone."""
-
-    def command(folder):
-        return [
-            sys.executable,
-            str(ROOT / "experiments" / "estimate.py"),
-            *bop_arguments(tiny_bop, folder),
-            f"hydra.run.dir={folder / 'run'}",
-        ]
-
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}
-    victim = tmp_path / "victim"
+    victim, log = tmp_path / "victim", tmp_path / "log"
+    arguments = [
+        *bop_arguments(tiny_bop, victim / "representations"),
+        f"hydra.run.dir={victim / 'run'}",
+    ]
     for pattern in ("representations/*.safetensors", "run/images/*.json"):
-        process = subprocess.Popen(command(victim), env=environment, stderr=subprocess.DEVNULL)
-        deadline = time.monotonic() + 600  # on a busy machine
-        while not list(victim.glob(pattern)):
-            assert process.poll() is None, "the run ended before it could be killed"
-            assert time.monotonic() < deadline
-            time.sleep(0.002)
-        process.send_signal(signal.SIGKILL)
-        process.wait()
+        kill_when(start_app("estimate", arguments, log), lambda pattern=pattern: any(victim.glob(pattern)))
         assert not (victim / "run" / "oracle_tiny-test.csv").exists()
-    subprocess.run(command(victim), env=environment, check=True, capture_output=True)
+    finish(start_app("estimate", arguments, log), log)
     rows = [
-        [line.split(",")[:-1] for line in (folder / "run" / "oracle_tiny-test.csv").read_text().splitlines()]
-        for folder in (victim, left_alone)
+        [line.split(",")[:-1] for line in (folder / "oracle_tiny-test.csv").read_text().splitlines()]
+        for folder in (victim / "run", left_alone)
     ]
     assert rows[0] == rows[1]
     assert len(rows[0]) == 4
@@ -307,12 +287,13 @@ def test_onboard_skips_what_is_there(tiny_bop, monkeypatch, tmp_path, capsys):
     arguments = [
         "experiment=oracle",
         *SMALL,
+        "viewpoints.count=12",
         f"representations={tmp_path}",
         f"hydra.run.dir={tmp_path / 'log'}",
     ]
     run_app(monkeypatch, "onboard", *arguments, f"data.root={tiny_bop}", "objects=[2]")
     out = capsys.readouterr().out
-    assert re.search(r"tiny-000002: onboarded in [\d.]+ s \(rendering [\d.]+ s, .*\), 60 templates", out)
+    assert re.search(r"tiny-000002: onboarded in [\d.]+ s \(rendering [\d.]+ s, .*\), 12 templates", out)
     run_app(monkeypatch, "onboard", *arguments, f"data.root={tiny_bop}")
     out = capsys.readouterr().out
     assert "tiny-000001: onboarded" in out
@@ -336,7 +317,7 @@ def test_objects_are_found_in_a_folder_and_a_video(own_picture, monkeypatch, tmp
     few = ["detector.candidates=8", "detector.max_detections=2", "detector.dense.scale=1"]
     arguments = [*arguments, *few, f"meshes=[{folder / 'cup.ply'}]"]
     run = [*arguments, f"image={pictures}", f"hydra.run.dir={tmp_path / 'run'}"]
-    run_app_on_one_thread("estimate", *run)
+    run_app(monkeypatch, "estimate", *run)
     entries = json.loads((tmp_path / "run" / "estimates.json").read_text())
     (best,) = [entry for entry in entries if entry["picture"] == "a"]
     center = torch.tensor(best["t"]) / best["t"][2]
@@ -348,7 +329,7 @@ def test_objects_are_found_in_a_folder_and_a_video(own_picture, monkeypatch, tmp
 
     # What is done is not repeated.
     before = (tmp_path / "run" / "pictures" / "a.json").stat().st_mtime_ns
-    run_app_on_one_thread("estimate", *run)
+    run_app(monkeypatch, "estimate", *run)
     assert (tmp_path / "run" / "pictures" / "a.json").stat().st_mtime_ns == before
 
     film = cv2.VideoWriter(str(tmp_path / "film.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 10, (160, 120))
@@ -356,7 +337,8 @@ def test_objects_are_found_in_a_folder_and_a_video(own_picture, monkeypatch, tmp
         film.write(np.full((120, 160, 3), 90, np.uint8))
     film.release()
     with pytest.raises(SystemExit) as ended:  # nothing is in it
-        run_app_on_one_thread(
+        run_app(
+            monkeypatch,
             "estimate",
             *arguments,
             f"image={tmp_path / 'film.avi'}",
@@ -373,11 +355,11 @@ def test_objects_are_found_in_a_folder_and_a_video(own_picture, monkeypatch, tmp
     assert "not found: " in capsys.readouterr().err
 
 
-def test_detect_and_evaluate_what_was_found(left_alone, tiny_bop, monkeypatch, tmp_path, capsys):
+def test_detect_and_evaluate_what_was_found(representations, tiny_bop, monkeypatch, tmp_path, capsys):
     """From pictures to scores, where the regions are those of a file that does not say what they show."""
     proposals = tiny_bop / "detections" / "cnos-fastsam" / "detections.json"
     arguments = [
-        *(a for a in bop_arguments(tiny_bop, left_alone) if not a.startswith(("masks", "overlays"))),
+        *(a for a in bop_arguments(tiny_bop, representations) if not a.startswith(("masks", "overlays"))),
         "proposer=file",
         f"proposer.path={proposals}",
     ]

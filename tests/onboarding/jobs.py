@@ -1,4 +1,4 @@
-"""What the tests run in processes of their own; imports little, as each of them starts anew."""
+"""What the tests run in processes of their own."""
 
 import os
 import signal

@@ -1,4 +1,3 @@
-import multiprocessing
 import os
 import signal
 import time
@@ -8,6 +7,7 @@ import torch
 from filelock import FileLock
 
 from foundpose.onboarding import ArtefactStore
+from tests.processes import CONTEXT
 
 FACTS = {"mesh": "abc", "size": 420, "nested": {"sigma": 0.5, "name": None}}
 
@@ -141,9 +141,8 @@ def _get_slowly(folder, barrier, queue):
 
 
 def test_jobs_that_ask_at_once_make_it_once(tmp_path):
-    context = multiprocessing.get_context("spawn")
-    barrier, queue = context.Barrier(3), context.Queue()
-    jobs = [context.Process(target=_get_slowly, args=(tmp_path, barrier, queue)) for _ in range(3)]
+    barrier, queue = CONTEXT.Barrier(3), CONTEXT.Queue()
+    jobs = [CONTEXT.Process(target=_get_slowly, args=(tmp_path, barrier, queue)) for _ in range(3)]
     for job in jobs:
         job.start()
     results = [queue.get(timeout=600) for _ in jobs]
@@ -171,7 +170,7 @@ def _die(folder, moment):
 
 @pytest.mark.parametrize("moment", ["computing", "writing"])
 def test_a_killed_writer_leaves_neither_a_broken_file_nor_a_lock(tmp_path, moment):
-    job = multiprocessing.get_context("spawn").Process(target=_die, args=(tmp_path, moment))
+    job = CONTEXT.Process(target=_die, args=(tmp_path, moment))
     job.start()
     job.join(timeout=600)
     assert job.exitcode == -signal.SIGKILL

@@ -1,4 +1,3 @@
-import multiprocessing
 import os
 import signal
 from pathlib import Path
@@ -16,6 +15,7 @@ from foundpose.representation import ObjectRepresentation
 from foundpose.retrieval import SoftAssignBow, VisualWords
 from foundpose.synthetic import procedural_mesh
 from tests.onboarding.jobs import SIZE, die_while_writing_descriptors, onboard, small_onboarder
+from tests.processes import CONTEXT
 
 KINDS = ["descriptors", "patches", "renderings", "words"]
 EVERYTHING = {"renderings", "patches", "descriptors", "PCA", "words"}
@@ -255,9 +255,8 @@ def test_progress_tells_the_stages_that_are_run(blob, tmp_path):
 
 @pytest.mark.parametrize("with_artefacts", [False, True])
 def test_two_processes_onboard_an_object_once(blob, tmp_path, with_artefacts):
-    context = multiprocessing.get_context("spawn")
-    barrier, queue = context.Barrier(2), context.Queue()
-    job = context.Process(target=onboard, args=(tmp_path, with_artefacts, barrier, queue))
+    barrier, queue = CONTEXT.Barrier(2), CONTEXT.Queue()
+    job = CONTEXT.Process(target=onboard, args=(tmp_path, with_artefacts, barrier, queue))
     job.start()
     onboard(tmp_path, with_artefacts, barrier, queue)  # this process is the other one
     results = [queue.get(timeout=600) for _ in range(2)]
@@ -276,7 +275,7 @@ def test_two_processes_onboard_an_object_once(blob, tmp_path, with_artefacts):
 
 
 def test_a_killed_job_loses_only_the_stage_that_it_was_at(blob, tmp_path, monkeypatch):
-    job = multiprocessing.get_context("spawn").Process(target=die_while_writing_descriptors, args=(tmp_path,))
+    job = CONTEXT.Process(target=die_while_writing_descriptors, args=(tmp_path,))
     job.start()
     job.join(timeout=600)
     assert job.exitcode == -signal.SIGKILL

@@ -40,7 +40,7 @@ from foundpose.retrieval import (
     VisualWords,
 )
 from foundpose.retrieval.base import select_templates
-from foundpose.synthetic import cluttered_scene, procedural_mesh
+from foundpose.synthetic import cluttered_scene
 
 SIZE = (480, 640)
 K = intrinsics_matrix(600.0, 605.0, 322.0, 236.0)
@@ -108,10 +108,8 @@ def test_noise_on_a_third_of_the_patches(scene, oracle_blob):
     assert (e.score > 0.45).all()
 
 
-def test_alone_as_in_a_batch_with_other_objects(scene, oracle_blob, oracle_onboarder):
+def test_alone_as_in_a_batch_with_other_objects(scene, oracle_blob, other_mesh, oracle_other):
     image, masks, T_true = scene
-    other_mesh = procedural_mesh(8, subdivisions=5)
-    other = oracle_onboarder(other_mesh, "other")
     T_other = pose_at(other_mesh, (300.0, 220.0), 600.0, 5)[None]
     renderer = CoordinateRenderer()
     images = torch.stack([image, render_coordinate_image(renderer, [other_mesh], list(T_other), K, SIZE)])
@@ -122,14 +120,16 @@ def test_alone_as_in_a_batch_with_other_objects(scene, oracle_blob, oracle_onboa
         batch = pipeline(
             images,
             K.expand(2, 3, 3),
-            [oracle_blob, other],
+            [oracle_blob, oracle_other],
             masks=all_masks,
             image_index=torch.tensor([1, 0, 0, 0]),
             object_index=torch.tensor([1, 0, 0, 0]),
         )
         alone = [
             pipeline(images[i][None], K[None], r, masks=all_masks[b : b + 1])
-            for b, (i, r) in enumerate(((1, other), (0, oracle_blob), (0, oracle_blob), (0, oracle_blob)))
+            for b, (i, r) in enumerate(
+                ((1, oracle_other), (0, oracle_blob), (0, oracle_blob), (0, oracle_blob))
+            )
         ]
     assert batch.valid.tolist() == [True, True, False, True]
     assert batch.status[2] == PoseStatus.UNUSABLE_MASK
@@ -270,10 +270,11 @@ def test_bad_input(scene, oracle_blob):
         pipeline(image[None], K[None], oracle_blob, masks=masks[:0], image_index=index[:0])
 
 
-def small_transformer(blob, seed=0):
-    """A small DINOv2 with random weights, an object onboarded with it, and a picture."""
+@pytest.fixture(scope="module")
+def small_transformer(blob):
+    """A small DINOv2 with random weights, bags of words, and an object onboarded with them."""
     size = {"hidden_size": 48, "num_attention_heads": 3, "num_hidden_layers": 2}
-    extractor = DinoV2("vits14_reg", layer=1, seed=seed, config=size, weights="random")
+    extractor = DinoV2("vits14_reg", layer=1, seed=0, config=size, weights="random")
     bow = SoftAssignBow(sigma=1.0)
     onboarder = Onboarder(
         RaycastRenderer(), extractor, SuperFibonacci(20), VisualWords(50), bow, projection=PcaProjection(32)
@@ -281,9 +282,16 @@ def small_transformer(blob, seed=0):
     return extractor, bow, onboarder(blob, "blob")
 
 
-def test_a_vision_transformer_takes_the_place_of_the_oracle(blob):
+@pytest.fixture
+def transformer(small_transformer):
+    """The same, without the gradients of the tests before."""
+    small_transformer[0].zero_grad()
+    return small_transformer
+
+
+def test_a_vision_transformer_takes_the_place_of_the_oracle(blob, transformer):
     """The whole path with DINOv2's architecture (small, random weights): it runs, and gradients reach the weights."""
-    extractor, bow, representation = small_transformer(blob)
+    extractor, bow, representation = transformer
     assert representation.template_cls.shape == (20, 48)
     picture = cluttered_scene(blob, seed=3)
     pipeline = make_pipeline(extractor, retriever=TemplateRetriever(bow, num_templates=3))
@@ -311,8 +319,10 @@ def assert_useful_gradients(module):
     ids=["hard", "soft"],
 )
 @pytest.mark.parametrize("soft_selection", [None, SoftInlierSelection(4)], ids=["hard_choice", "soft_choice"])
-def test_a_loss_on_the_pose_reaches_the_extractor(blob, matcher, soft_selection, differentiation):
-    extractor, bow, representation = small_transformer(blob)
+def test_a_loss_on_the_pose_reaches_the_extractor(
+    blob, transformer, matcher, soft_selection, differentiation
+):
+    extractor, bow, representation = transformer
     # A template as picture: random features recognise it, so there are inliers enough.
     T, intrinsics = representation.T_template_from_model[3], representation.K_template[3]
     render = RaycastRenderer()(blob, T[None], intrinsics[None], (420, 420))
@@ -395,8 +405,8 @@ class NearestTemplates(Retriever):
         return select_templates(similarity, query.valid.any(dim=1), self.num_templates)
 
 
-def test_cls_tokens_retrieve(blob):
-    extractor, _, representation = small_transformer(blob)
+def test_cls_tokens_retrieve(scene, oracle_blob, blob, transformer):
+    extractor, _, representation = transformer
     T, intrinsics = representation.T_template_from_model[:6], representation.K_template[:6]
     render = RaycastRenderer()(blob, T, intrinsics, (420, 420))
     pipeline = make_pipeline(
@@ -411,23 +421,7 @@ def test_cls_tokens_retrieve(blob):
     assert (e.templates.index[:, 0] == torch.arange(6)).sum() >= 5
     assert e.valid.all()
     with pytest.raises(ValueError, match="the extractor gives no cls token"):
-        estimate_scene(make_pipeline(retriever=ClsRetriever()), scene_of(blob), oracle_of(blob))
-
-
-def scene_of(blob):
-    picture = cluttered_scene(blob, seed=3)
-    return picture.image, picture.mask.expand(2, -1, -1), None
-
-
-def oracle_of(blob):
-    return Onboarder(
-        CoordinateRenderer(),
-        CoordinateCode(),
-        SuperFibonacci(6),
-        VisualWords(20),
-        SoftAssignBow(),
-        projection=PcaProjection(16),
-    )(blob, "blob")
+        estimate_scene(make_pipeline(retriever=ClsRetriever()), scene, oracle_blob)
 
 
 def test_pose_of_the_top_template(scene, oracle_blob, blob):
@@ -463,9 +457,8 @@ def test_pose_of_a_template_is_a_start_for_refiners(scene, oracle_blob, refine):
     assert after[1].max() < 0.5 * before[1].max()
 
 
-def test_poses_of_templates_alone_as_in_a_batch_and_unusable_masks(scene, oracle_blob, oracle_onboarder):
+def test_poses_of_templates_alone_as_in_a_batch_and_unusable_masks(scene, oracle_blob, oracle_other):
     image, masks, _ = scene
-    other = oracle_onboarder(procedural_mesh(8, subdivisions=4), "other")
     thin = torch.zeros(2, *SIZE, dtype=torch.bool)
     thin[1, 100, 100:400] = True
     all_masks = torch.cat([masks[:1], thin, masks[1:], masks[1:]])
@@ -475,13 +468,13 @@ def test_poses_of_templates_alone_as_in_a_batch_and_unusable_masks(scene, oracle
         batch = pipeline(
             image[None],
             K[None],
-            [oracle_blob, other],
+            [oracle_blob, oracle_other],
             masks=all_masks,
             image_index=torch.zeros(5).long(),
             object_index=which,
         )
         alone = [
-            pipeline(image[None], K[None], [oracle_blob, other][which[b]], masks=all_masks[b : b + 1])
+            pipeline(image[None], K[None], [oracle_blob, oracle_other][which[b]], masks=all_masks[b : b + 1])
             for b in range(5)
         ]
     expected = [PoseStatus.OK, PoseStatus.UNUSABLE_MASK, PoseStatus.NO_PATCHES, PoseStatus.OK, PoseStatus.OK]
@@ -565,7 +558,7 @@ def test_starts_and_verification_choose_among_more_hypotheses(blob, oracle_blob)
 def test_pictures_in_half_precision(scene, blob):
     _, masks, T = scene
     extractor, bow = DenseSift(), SoftAssignBow(0.3)
-    onboard = Onboarder(RaycastRenderer(), extractor, SuperFibonacci(20), VisualWords(16), bow)
+    onboard = Onboarder(RaycastRenderer(), extractor, SuperFibonacci(8), VisualWords(16), bow)
     representation = onboard(blob, "blob")
     image = RaycastRenderer()(blob, T, K.expand(2, 3, 3), SIZE).rgb.amax(dim=0)
     pipeline = make_pipeline(extractor, retriever=TemplateRetriever(bow))

@@ -250,7 +250,8 @@ def test_gradients_agree_with_finite_differences(points: int, shape: str) -> Non
     # The refinement stops after five steps, so the gradient of the optimum differs a little from that of the steps.
     def check(inputs: list[Tensor]) -> bool:
         inputs = [x.clone().requires_grad_() for x in inputs]
-        return torch.autograd.gradcheck(pose, inputs, eps=1e-6, atol=1e-4, rtol=1e-3)
+        # Every entry of small problems, random projections (fast mode) of the large one.
+        return torch.autograd.gradcheck(pose, inputs, eps=1e-6, atol=1e-4, rtol=1e-3, fast_mode=points == 20)
 
     inputs = [image, model[..., :moving], parameters]
     assert check(inputs if points == 4 else [*inputs, weights])

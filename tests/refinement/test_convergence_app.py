@@ -6,7 +6,7 @@ from PIL import Image
 from tests.experiments.test_apps import SMALL, run_app
 
 
-def test_convergence_app(tiny_bop, monkeypatch, tmp_path, capsys):
+def test_convergence_app(tiny_bop, representations, monkeypatch, tmp_path, capsys):
     """Oracle codes on a tiny dataset: refinement finds perturbed poses again; table and plot are written."""
     run_app(
         monkeypatch,
@@ -15,7 +15,7 @@ def test_convergence_app(tiny_bop, monkeypatch, tmp_path, capsys):
         "experiment=oracle",
         "data=bop",
         f"data.root={tiny_bop}",
-        f"representations={tmp_path / 'representations'}",
+        f"representations={representations}",
         f"hydra.run.dir={tmp_path / 'run'}",
         "max_images=2",
         "max_degrees=6",
