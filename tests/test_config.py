@@ -182,8 +182,10 @@ def test_the_default_is_the_papers_but_for_what_was_measured():
     assert cfg.retrieval.retriever.bow == cfg.onboarder.bow
 
 
-# check.yaml and view.yaml have no method.
-@pytest.mark.parametrize("name", sorted({path.stem for path in CONF.glob("*.yaml")} - {"check", "view"}))
+# check.yaml, view.yaml and gpu_check.yaml have no method.
+@pytest.mark.parametrize(
+    "name", sorted({path.stem for path in CONF.glob("*.yaml")} - {"check", "view", "gpu_check"})
+)
 def test_every_app_builds_its_method(name, tmp_path):
     cfg = load(
         name,

@@ -123,7 +123,7 @@ def render(result: BenchmarkResult) -> str:
     if result.comparisons:
         parts.append(_comparison_table(result.comparisons))
     if result.checks:
-        parts.append(_check_table(result.checks))
+        parts.append(check_table(result.checks))
     return "\n".join(parts)
 
 
@@ -168,7 +168,8 @@ def _comparison_table(comparisons: Sequence[Comparison]) -> str:
     return _markdown(cells, "agreement")
 
 
-def _check_table(checks: Sequence[Check]) -> str:
+def check_table(checks: Sequence[Check]) -> str:
+    """Figures beside their limits, as Markdown."""
     cells = [
         {
             "Check": check.name,

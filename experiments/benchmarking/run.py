@@ -54,14 +54,14 @@ def run_benchmark(cfg: DictConfig, folder: Path, progress: Progress) -> Benchmar
     _check(cfg)
     if cfg.threads is not None:
         torch.set_num_threads(cfg.threads)
-    cfg = _prepared(cfg)
+    cfg = prepare(cfg)
     method = build_method(cfg)
     device = torch.device(cfg.device)
     hardware = describe_hardware(device)
     settings: MeasureSettings = instantiate(cfg.measure)
     extractor = method.pipeline.extractor
     backbones = {YARDSTICK: instantiate(cfg.yardstick).to(device).eval(), HOOKED: extractor}
-    sizes = _sizes(cfg, extractor.channels)
+    sizes = workload_sizes(cfg, extractor.channels)
     factory = partial(make_stages, cfg)
     workload = make_workload(sizes, device).to(_DTYPES[cfg.dtype])
     container: Any = OmegaConf.to_container(cfg, resolve=True)
@@ -197,7 +197,7 @@ def _check(cfg: DictConfig) -> None:
         raise ValueError(f"threads must be a positive integer or null, got {cfg.threads}")
 
 
-def _prepared(cfg: DictConfig) -> DictConfig:
+def prepare(cfg: DictConfig) -> DictConfig:
     """The configuration with the weights and the precision of both extractors settled."""
     cfg = copy.deepcopy(cfg)
     extractor, yardstick = cfg.extractor, cfg.yardstick
@@ -211,11 +211,11 @@ def _prepared(cfg: DictConfig) -> DictConfig:
     return cfg
 
 
-def _sizes(cfg: DictConfig, channels: int) -> WorkloadSizes:
-    """Sizes of the workload of one crop, for the extractor's descriptors."""
+def workload_sizes(cfg: DictConfig, channels: int, batch_size: int = 1, images: int = 1) -> WorkloadSizes:
+    """Sizes of the configured workload, for an extractor's descriptors and a number of crops and pictures."""
     settings: Any = OmegaConf.to_container(cfg.sizes, resolve=True)
     settings["image_size"] = tuple(settings["image_size"])
-    return WorkloadSizes(**settings, channels=channels)
+    return WorkloadSizes(**settings, channels=channels, batch_size=batch_size, images=images)
 
 
 def _with_batch(workload: Workload, batch_size: int, crops_per_image: int) -> Workload:

@@ -208,7 +208,7 @@ def test_results_in_steps_are_the_same(boxes, results, monkeypatch):
     assert score_results(boxes, results, errors=("mssd", "mspd", "vsd", "add_s")).to_json() == whole
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.gpu
 def test_cuda_gives_the_same(boxes, results):
     names = ("mssd", "mspd", "vsd", "add_s")
     on_cpu, on_gpu = (score_results(boxes, results, names, device=d).to_json() for d in ("cpu", "cuda"))

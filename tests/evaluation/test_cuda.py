@@ -19,7 +19,7 @@ from foundpose.retrieval import SoftAssignBow, VisualWords
 from tests.pipeline.test_foundpose import make_pipeline
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.gpu
 def test_cuda_equals_the_cpu(lmo_root, tmp_path):
     dataset = BopDataset(lmo_root)
     onboarder = Onboarder(

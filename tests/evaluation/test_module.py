@@ -286,7 +286,7 @@ def test_no_clock_waits_unless_stages_are_timed(root, store, tmp_path, monkeypat
         assert record["seconds"]["pipeline"] > 0
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.gpu
 def test_auto_on_a_gpu(root, store, tmp_path):
     dataset = BopDataset(root)
     objects = DatasetObjects(dataset, store)

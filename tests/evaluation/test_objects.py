@@ -256,7 +256,7 @@ def test_the_store_maps_files_unless_told_otherwise(root, tmp_path) -> None:
         del representation, objects
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.gpu
 @pytest.mark.parametrize("storage", ["float32", "int8", "pq"])
 def test_on_a_gpu_representations_are_copies(root, tmp_path, storage) -> None:
     objects = DatasetObjects(BopDataset(root), make_store(tmp_path, storage=storage, pq_subspaces=4))

@@ -47,7 +47,7 @@ def test_fused_attention_runs_and_equals_the_formula(name: str, images, monkeypa
     torch.testing.assert_close(found, expected, atol=2e-5, rtol=2e-5)
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.gpu
 def test_attention_is_fused_on_a_gpu() -> None:
     """Without the kernel that writes out all products there is still one that serves, in every precision."""
     images = torch.rand(2, 3, 420, 420, device="cuda")

@@ -90,7 +90,7 @@ def test_instructions_are_those_that_linux_tells(monkeypatch) -> None:
     assert cpu_instructions() == set()
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.gpu
 def test_auto_on_a_gpu(images) -> None:
     exact, auto = tiny().cuda(), tiny(precision="auto").cuda()
     with torch.no_grad():

@@ -170,7 +170,7 @@ def test_artefacts_change_no_bit(blob, tmp_path, renderer, extractor):
     assert_same(plain, store.get(blob, "blob"))
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.gpu
 def test_artefacts_on_a_gpu(blob, tmp_path):
     onboarder = small_onboarder().cuda()
     plain = onboarder(blob, "blob")

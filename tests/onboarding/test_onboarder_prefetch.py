@@ -158,7 +158,7 @@ def test_a_failure_in_onboarding_leaves_no_thread(blob, ahead, part):
     assert ("templates", 10, 10) not in reports
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.gpu
 def test_cuda_prefetches_without_waiting_and_equals_the_cpu(blob):
     expected = small_onboarder()(blob, "blob")
     onboarder = small_onboarder().cuda()

@@ -228,7 +228,7 @@ def test_another_extractor_is_noticed_when_it_is_swapped(scene, oracle_blob):
             pipeline(image[None], K[None], oracle_blob, masks=masks[:1])
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.gpu
 def test_cuda_equals_the_cpu(scene, oracle_blob, oracle_onboarder, blob):
     image, masks, T_true = scene
     index = torch.tensor([0, 0])

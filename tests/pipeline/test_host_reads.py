@@ -101,7 +101,7 @@ def test_the_counter_sees_reads() -> None:
     assert reads.places
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.gpu
 def test_a_gpu_is_waited_for_in_the_same_places_only() -> None:
     workload = make_workload(SIZES, "cuda")
     method = pipeline(workload).cuda()

@@ -15,7 +15,7 @@ MIB = 2**20
 linux = pytest.mark.skipif(sys.platform != "linux", reason="needs Linux")
 DEVICES = [
     pytest.param("cpu", marks=linux),
-    pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")),
+    pytest.param("cuda", marks=pytest.mark.gpu),
 ]
 
 
@@ -33,7 +33,7 @@ def test_peak_memory_is_what_a_run_allocates(device):
     assert peak_memory(lambda _: None, 1, torch.device(device)) < 10 * MIB
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.gpu
 def test_free_memory_of_a_gpu_counts_what_torch_could_give_back():
     device = torch.device("cuda")
     before = free_memory(device)

@@ -94,7 +94,7 @@ def test_no_peak_memory_where_it_cannot_be_told(monkeypatch, tmp_path):
     assert peak.memory == (None, None, "not measured on mps")
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.gpu
 def test_peak_memory_on_a_gpu():
     device = torch.device("cuda")
     kept = torch.ones(10 * MIB, device=device)
@@ -103,7 +103,7 @@ def test_peak_memory_on_a_gpu():
     assert memory.peak >= memory.rise + kept.numel() * 4
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.gpu
 def test_host_syncs_on_a_gpu():
     x = torch.ones(5, device="cuda")
     assert count_host_syncs(lambda: x + x) == 0

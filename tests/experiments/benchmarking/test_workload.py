@@ -183,7 +183,7 @@ def test_bad_sizes(changes, message):
         replace(SIZES, **changes)
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.gpu
 def test_same_workload_on_a_gpu(workload):
     other = make_workload(SIZES, "cuda")
     assert torch.allclose(workload.features, other.features.cpu(), atol=1e-3)
