@@ -43,22 +43,22 @@ def sample_features(
     vertical, horizontal = torch.stack([down, down, down_slope]), torch.stack([across, across_slope, across])
     weights = (vertical.unsqueeze(-1) * horizontal.unsqueeze(-2)).flatten(3).flatten(1, 2)  # (3, n P, k²)
     table, cell = features.reshape(-1, d), cell.flatten(2).flatten(0, 1)
-    sampled = _weighted_rows(table, cell, weights).unflatten(1, position.shape[:2])
+    weighted = bagged_rows if table.device.type == "cpu" else gathered_rows
+    sampled = weighted(table, cell, weights).unflatten(1, position.shape[:2])
     return sampled.permute(1, 2, 0, 3)
 
 
-def _weighted_rows(table: Tensor, cell: Tensor, weights: Tensor) -> Tensor:
+def gathered_rows(table: Tensor, cell: Tensor, weights: Tensor) -> Tensor:
     """Sums (s, n, d) of rows of a table (m, d), chosen by (n, k) and weighted by (s, n, k)."""
-    if table.device.type == "cpu":
-        # In one pass that writes no more than the sums: a third to a seventh of the time.
-        bags = cell.repeat(len(weights), 1)
-        flat = weights.flatten(0, 1)
-        return F.embedding_bag(bags, table, per_sample_weights=flat, mode="sum").unflatten(
-            0, weights.shape[:2]
-        )
     # Whole rows: several times as fast as indexing by a tensor.
     rows = table.index_select(0, cell.flatten()).unflatten(0, cell.shape)
     return (weights.transpose(0, 1) @ rows).transpose(0, 1)
+
+
+def bagged_rows(table: Tensor, cell: Tensor, weights: Tensor) -> Tensor:
+    """:func:`gathered_rows` in one pass that writes the sums alone: a third to a seventh of the time on a CPU."""
+    bags, flat = cell.repeat(len(weights), 1), weights.flatten(0, 1)
+    return F.embedding_bag(bags, table, per_sample_weights=flat, mode="sum").unflatten(0, weights.shape[:2])
 
 
 def _kernel(position: Tensor, size: int, interpolation: Interpolation) -> tuple[Tensor, Tensor, Tensor]:

@@ -4,6 +4,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from foundpose.refinement import sample_features
+from foundpose.refinement.interpolation import bagged_rows, gathered_rows
 
 
 def maps(seed: int = 0, m: int = 2, h: int = 6, w: int = 8, d: int = 3) -> Tensor:
@@ -89,3 +90,14 @@ def test_bicubic_slopes_are_continuous_and_linear_maps_are_exact() -> None:
         torch.testing.assert_close(got[..., 0, 0], 2 * inner[..., 0] - inner[..., 1])
         torch.testing.assert_close(got[..., 1, :], torch.tensor([2.0, 0.0]).double().expand(1, 20, 2))
         torch.testing.assert_close(got[..., 2, :], torch.tensor([-1.0, 1.0]).double().expand(1, 20, 2))
+
+
+def test_rows_are_read_alike_on_all_devices() -> None:
+    generator = torch.Generator().manual_seed(0)
+    table = torch.randn(30, 5, generator=generator, dtype=torch.float64, requires_grad=True)
+    cell = torch.randint(30, (7, 4), generator=generator)
+    weights = torch.randn(3, 7, 4, generator=generator, dtype=torch.float64, requires_grad=True)
+    found = [rows(table, cell, weights) for rows in (gathered_rows, bagged_rows)]
+    torch.testing.assert_close(found[0], found[1])
+    gradients = [torch.autograd.grad(each.square().sum(), (table, weights)) for each in found]
+    torch.testing.assert_close(gradients[0], gradients[1])
