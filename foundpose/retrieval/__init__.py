@@ -8,6 +8,7 @@ from foundpose.retrieval.bow import (
     WordAssignment,
     inverse_document_frequency,
 )
+from foundpose.retrieval.object_index import ObjectIndex, RankedObjects
 from foundpose.retrieval.retriever import ClsRetriever, EveryTemplate, TemplateRetriever
 from foundpose.retrieval.spatial import SpatialReranker
 from foundpose.retrieval.votes import PatchVoteRetriever
@@ -18,8 +19,10 @@ __all__ = [
     "ClsRetriever",
     "EveryTemplate",
     "IdfMode",
+    "ObjectIndex",
     "PatchVoteRetriever",
     "QueryPatches",
+    "RankedObjects",
     "RetrievedTemplates",
     "Retriever",
     "SoftAssignBow",
