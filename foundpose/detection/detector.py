@@ -10,7 +10,7 @@ from foundpose.detection.dense import DensePatches
 from foundpose.detection.proposals import Pictures, Proposals, Proposer, mask_overlaps, suppress
 from foundpose.detection.scoring import ProposalScorer
 from foundpose.features import PatchExtractor
-from foundpose.representation import ObjectRepresentation
+from foundpose.representation import ExtractorChecks, ObjectRepresentation
 
 
 class Detections(NamedTuple):
@@ -83,6 +83,7 @@ class Detector(nn.Module):
         self.across_objects = across_objects
         self.min_score = min_score
         self.max_detections = max_detections
+        self._checks = ExtractorChecks()
 
     def forward(
         self,
@@ -149,9 +150,8 @@ class Detector(nn.Module):
             raise ValueError(f"K must have shape ({len(images)}, 3, 3), got {tuple(K.shape)}")
         if not objects:
             raise ValueError("objects is empty: give at least one object representation")
-        fingerprint = self.extractor.fingerprint()
         for obj in objects:
-            obj.check_extractor(fingerprint)
+            self._checks(obj, self.extractor)
 
 
 def _rank_among_equals(labels: Tensor) -> Tensor:

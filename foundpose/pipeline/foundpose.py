@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from foundpose.features.base import Fingerprint, PatchExtractor
+from foundpose.features.base import PatchExtractor
 from foundpose.geometry import Crops, PerspectiveCrop
 from foundpose.pipeline.hypotheses import HypothesisMaker
 from foundpose.pipeline.query import describe_query
@@ -14,35 +14,9 @@ from foundpose.pipeline.results import PoseEstimates
 from foundpose.pipeline.selection import choose_coarse
 from foundpose.refinement import Observation, PoseRefiner
 from foundpose.rendering import Mesh, Renderer
-from foundpose.representation import ObjectGroups, ObjectRepresentation, RepresentationInfo, take_rows
+from foundpose.representation import ExtractorChecks, ObjectGroups, ObjectRepresentation, take_rows
 from foundpose.retrieval import Retriever
 from foundpose.utils.warn import warn_caller
-
-
-class _ExtractorChecks:
-    """Checks once for each representation that it was made with the extractor at hand.
-
-    A fingerprint may cost a pass over all weights, so it is taken when an object or an extractor is new. Training the
-    extractor after that is the caller's business.
-    """
-
-    def __init__(self, capacity: int = 1024) -> None:
-        self.capacity = capacity
-        self._extractor: PatchExtractor | None = None
-        self._fingerprint: Fingerprint = {}
-        self._passed: list[RepresentationInfo] = []
-
-    def __call__(self, representation: ObjectRepresentation, extractor: PatchExtractor) -> bool:
-        """Raise ValueError for another extractor; say whether the representation had not been seen before."""
-        if extractor is not self._extractor:
-            self._extractor, self._fingerprint, self._passed = extractor, extractor.fingerprint(), []
-        if any(info is representation.info for info in self._passed):
-            return False
-        if representation.info.extractor != self._fingerprint:
-            self._fingerprint = extractor.fingerprint()
-        representation.check_extractor(self._fingerprint)
-        self._passed = [*self._passed, representation.info][-self.capacity :]
-        return True
 
 
 class FoundPose(nn.Module):
@@ -78,7 +52,7 @@ class FoundPose(nn.Module):
         self.hypotheses = hypotheses
         self.refiner = refiner
         self.refine: RefineWhat = refine
-        self._checks = _ExtractorChecks()
+        self._checks = ExtractorChecks()
 
     def forward(
         self,
