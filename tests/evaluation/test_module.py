@@ -6,6 +6,7 @@ import pytorch_lightning as pl
 import torch
 from PIL import Image
 
+import foundpose
 import foundpose.utils.batch_size
 import foundpose.utils.timing
 from foundpose.bop import BopDataset, detected_instances, ground_truth_instances
@@ -17,8 +18,8 @@ from foundpose.evaluation.records import to_results
 from foundpose.evaluation.report import all_records, merge_shards, timing
 from foundpose.evaluation.shards import shard_path
 from foundpose.geometry import rotation_angle
-from foundpose.onboarding import RepresentationStore
 from tests.bop_dataset import make_bop_dataset
+from tests.experiments.test_apps import SMALL
 from tests.pipeline.test_foundpose import make_pipeline
 
 NUM_IMAGES = 5
@@ -30,8 +31,9 @@ def root(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory, oracle_onboarder):
-    return RepresentationStore(tmp_path_factory.mktemp("representations"), oracle_onboarder)
+def store(representations):
+    """Objects as the apps' tests have them."""
+    return foundpose.load(overrides=["experiment=oracle", *SMALL, f"representations={representations}"]).store
 
 
 def both_detections(dataset):

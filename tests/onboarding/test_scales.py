@@ -37,6 +37,7 @@ def dense_blob(oracle_onboarder, blob) -> ObjectRepresentation:
         VisualWords(64, 3),
         SoftAssignBow(),
         PcaProjection(D),
+        image_size=280,
     )
     return dense(blob, "blob")
 

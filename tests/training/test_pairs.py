@@ -1,7 +1,5 @@
 import copy
 import dataclasses
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -31,15 +29,6 @@ from foundpose.training import (
     nearby_rotations,
     render_crops,
 )
-
-
-def test_importing_the_library_does_not_import_lightning():
-    code = (
-        "import foundpose, foundpose.evaluation.objects, foundpose.evaluation.report, foundpose.synthetic, sys; "
-        "print('pytorch_lightning' in sys.modules)"
-    )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert result.stdout.strip() == "False"
 
 
 def test_nearby_rotations_are_within_bounds_and_spread():

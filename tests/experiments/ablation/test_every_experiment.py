@@ -5,7 +5,7 @@ import json
 import pytest
 from omegaconf import OmegaConf
 
-from ablation.runs import run_once
+from ablation.runs import run_folder, run_once
 from tests.test_config import CONF, SIZES, SMALL_MEGAPOSE, load
 from tests.test_config import SMALL as SMALL_NETWORKS
 
@@ -24,16 +24,23 @@ def small_network(cfg):
     return common + layer + SMALL_NETWORKS[kind]
 
 
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Of all runs: they share renderings and descriptors, and experiments that differ in nothing but what is made
+    small here are one run."""
+    return tmp_path_factory.mktemp("experiments")
+
+
 @pytest.mark.parametrize("name", EXPERIMENTS)
-def test_experiment_runs(name, tiny_bop, tmp_path):
+def test_experiment_runs(name, tiny_bop, folder):
     plain = load("ablate", f"experiment={name}")
     megapose = "MegaPose" in OmegaConf.to_yaml(plain)
+    iterations = ["refiner.iterations", "refiners.megapose.iterations"]
     count = ["num_views=2", "num_inplane=4"] if "num_views" in plain.viewpoints else ["count=8"]
     overrides = [
         f"experiment={name}",
         f"data.root={tiny_bop}",
-        f"folder={tmp_path}",
-        *([] if name.startswith("table2") else ["artefacts=null"]),
+        f"folder={folder}",
         "objects=[1]",
         "max_images=1",
         *(f"viewpoints.{setting}" for setting in count),
@@ -43,14 +50,17 @@ def test_experiment_runs(name, tiny_bop, tmp_path):
         "trainer.accelerator=cpu",
         *small_network(plain),
         *(SMALL_MEGAPOSE if megapose else []),
+        *(f"{key}=1" for key in iterations if megapose and OmegaConf.select(plain, key)),
     ]
-    record = run_once(load("ablate", *overrides), name)  # overrides that a user makes would end the row
+    cfg = load("ablate", *overrides)
+    run = run_folder(cfg)
+    record = run_once(cfg, name)  # overrides that a user makes would end the row
     assert record.status == "finished", record.error
-    assert record.row == (name if name.startswith("table") else None)
+    assert record.row == (record.name if record.name.startswith("table") else None)
     random = "weights" in plain.extractor or megapose
     assert (record.label is not None) == random
     assert record.figures["targets"] == 1
-    estimates = json.loads((next((tmp_path / "runs").iterdir()) / "estimates.json").read_text())
+    estimates = json.loads((run / "estimates.json").read_text())
     masks = 5 if plain.masks.get("masks_per_instance", 1) == 5 else 1
     assert len(estimates) == min(masks, 2)  # there are two detections
 
