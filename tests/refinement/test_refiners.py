@@ -18,7 +18,6 @@ from foundpose.refinement import (
 from foundpose.rendering import CoordinateRenderer
 from foundpose.rendering.coordinates import render_coordinate_image
 from foundpose.retrieval import SoftAssignBow, TemplateRetriever
-from foundpose.synthetic import procedural_mesh
 from tests.pipeline.test_foundpose import SIZE, K, pose_at
 
 
@@ -76,10 +75,8 @@ def test_refinement_improves_coarse_poses(views, oracle_blob, blob, refine):
     assert torch.equal(e.num_inliers, e.hypotheses.num_inliers[row, e.best])
 
 
-def test_alone_as_in_a_batch_with_other_objects(views, oracle_blob, oracle_onboarder):
+def test_alone_as_in_a_batch_with_other_objects(views, oracle_blob, other_mesh, oracle_other):
     images, masks, _ = views
-    other_mesh = procedural_mesh(8, subdivisions=5)
-    other = oracle_onboarder(other_mesh, "other")
     T = pose_at(other_mesh, (310.0, 220.0), 650.0, 5)[None]
     image = render_coordinate_image(CoordinateRenderer(), [other_mesh], list(T), K, SIZE)
     mask = CoordinateRenderer()(other_mesh, T, K[None], SIZE).mask
@@ -89,13 +86,13 @@ def test_alone_as_in_a_batch_with_other_objects(views, oracle_blob, oracle_onboa
         together = pipeline(
             torch.stack([images[0], image, images[1]]),
             K.expand(3, 3, 3),
-            [oracle_blob, other],
+            [oracle_blob, oracle_other],
             masks=torch.cat([mask, masks[:1], empty, masks[1:2]]),
             image_index=torch.tensor([1, 0, 0, 2]),
             object_index=torch.tensor([1, 0, 0, 0]),
         )
         alone = pipeline(images[1:2], K[None], oracle_blob, masks=masks[1:2])
-        first = pipeline(image[None], K[None], other, masks=mask)
+        first = pipeline(image[None], K[None], oracle_other, masks=mask)
     assert together.valid.tolist() == [True, True, False, True]
     assert together.status[2] == PoseStatus.UNUSABLE_MASK
     assert together.score[2] == 0
