@@ -1,6 +1,7 @@
 """Objects found, with their poses, in pictures of one's own: a file, a folder or a video."""
 
 import json
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -8,18 +9,22 @@ from typing import Any
 import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
+from PIL import Image
 from torch import Tensor
 
 from estimate import check_words, numbers_of_instances, read_intrinsics, undistort
 from foundpose.bop import read_image, write_results
 from foundpose.config import build_detector, build_method, claim_run_folder
+from foundpose.evaluation.page import thumbnail, write_pictures_report
 from foundpose.evaluation.records import pose_records, to_results
 from foundpose.pipeline import DetectAndEstimate, FoundInstances
+from foundpose.pipeline.figure import ObjectView
 from foundpose.rendering import Mesh, RaycastRenderer, load_mesh
+from foundpose.representation import ObjectRepresentation
 from foundpose.utils.files import write_atomically, write_json
 from foundpose.utils.progress import ProgressBars, say, track
 from foundpose.utils.timing import StageTimer
-from foundpose.visualization import draw_instances, to_pil
+from foundpose.visualization import REFINED, draw_instances, to_pil
 
 PICTURES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm"}
 VIDEOS = {".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v"}
@@ -64,16 +69,51 @@ def find_in_pictures(cfg: DictConfig, output: Path) -> bool:
             facts = {"picture": name, "scene_id": 0, "im_id": number, "time": timer.seconds["finder"]}
             drawn = _overlay(straight, K, found, meshes, records)
             write_atomically(output / "overlays" / f"{name}.png", to_pil(drawn).save)
+            if found is not None:
+                _draw(output / "figures", name, straight, K, found, objects)
             write_json(file, [facts | record for record in records])
         entries += json.loads(file.read_text(encoding="utf-8"))
     write_json(output / "estimates.json", entries)
     write_results(output / "results.csv", to_results(entries))
+    _write_report(output, entries, cfg.report)
     print(json.dumps(entries, indent=1))
     print(f"{len(entries)} instances found; written to {output}")
     for path in paths:
         if not any(entry["mesh"] == str(path) for entry in entries):
             say(f"not found: {path}")
     return bool(entries)
+
+
+def _draw(
+    folder: Path,
+    name: str,
+    image: Tensor,
+    K: Tensor,
+    found: FoundInstances,
+    objects: list[ObjectRepresentation],
+) -> None:
+    """How each pose of a picture came about, and a small picture of each."""
+    for i, T in enumerate(found.estimates.T_camera_from_model.cpu()):
+        write_atomically(folder / f"{name}_{i}.webp", found.estimates.draw(i).save)
+        view = ObjectView(objects[int(found.detections.object_index[i])], None)
+        small = thumbnail(image, K, found.detections.masks[i].cpu() > 0.5, view, [(REFINED, T)])
+        write_atomically(folder / f"{name}_{i}_small.webp", small.save)
+
+
+def _write_report(output: Path, entries: list[dict[str, Any]], limits: DictConfig) -> None:
+    """report.html with all instances; the worst have a figure."""
+    counts: Counter[str] = Counter()
+    stems = []
+    for entry in entries:
+        stems.append(output / "figures" / f"{entry['picture']}_{counts[entry['picture']]}")
+        counts.update([entry["picture"]])
+    worst = sorted(range(len(entries)), key=lambda k: entries[k]["score"])
+    write_pictures_report(
+        output / "report.html",
+        [entry | {"image": entry["picture"]} for entry in entries],
+        {k: Image.open(f"{stems[k]}_small.webp") for k in worst[: limits.thumbnails]},
+        {k: Image.open(f"{stems[k]}.webp") for k in worst[: limits.figures]},
+    )
 
 
 def _mesh_paths(cfg: DictConfig) -> list[Path]:

@@ -138,8 +138,8 @@ def write_pictures_report(
 
     Args:
         path: of the HTML file.
-        records: as :func:`~foundpose.evaluation.records.pose_records` makes them, with ``image``, ``mesh`` and
-            ``time``.
+        records: as :func:`~foundpose.evaluation.records.pose_records` makes them, with ``image`` (its name), ``mesh``
+            (its file) and ``time``.
         thumbnails: small pictures, by place in ``records``.
         figures: large ones (``estimates.draw(i)``), by place in ``records``.
     """

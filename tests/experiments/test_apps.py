@@ -326,6 +326,12 @@ def test_objects_are_found_in_a_folder_and_a_video(own_picture, monkeypatch, tmp
     drawn = np.asarray(Image.open(tmp_path / "run" / "overlays" / "a.png")).astype(int)
     assert np.abs(drawn - np.asarray(Image.open(pictures / "a.png"))).sum() > 10_000
     assert len(read_results(tmp_path / "run" / "results.csv")) == len(entries)
+    page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
+    shown = re.search(r'<script id="data" type="application/json">(.*?)</script>', page, re.DOTALL)
+    assert shown is not None
+    cases = json.loads(shown[1])
+    assert len(cases["rows"]) == len(cases["thumbnails"]) == len(cases["figures"]) == len(entries)
+    assert [row["score"] for row in cases["rows"]] == sorted(entry["score"] for entry in entries)
 
     # What is done is not repeated.
     before = (tmp_path / "run" / "pictures" / "a.json").stat().st_mtime_ns
