@@ -4,7 +4,6 @@ Each is killed at two moments, and with ``FOUNDPOSE_ALL_KILLS=1`` in the environ
 """
 
 import json
-import multiprocessing
 import os
 import random
 import shutil
@@ -16,6 +15,7 @@ from safetensors import safe_open
 
 from tests.bop_dataset import make_bop_dataset
 from tests.kill_jobs import JOBS, outcome, run_job
+from tests.processes import CONTEXT, finish
 
 NUM_KILLS = 20 if os.environ.get("FOUNDPOSE_ALL_KILLS") else 2
 
@@ -25,45 +25,32 @@ def root(tmp_path_factory):
     return make_bop_dataset(tmp_path_factory.mktemp("kills") / "tiny", images=3)
 
 
-@pytest.fixture(scope="module")
-def context():
-    # Forks of a process that has imported everything start in no time.
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["tests.kill_jobs"])
-    return context
-
-
-def start(context, name, folder, root):
+def start(name, folder, root):
     """Start a job and wait until it is at work."""
     folder.mkdir(exist_ok=True)
-    ready = context.Event()
-    job = context.Process(target=run_job, args=(name, folder, root, ready))
+    ready = CONTEXT.Event()
+    job = CONTEXT.Process(target=run_job, args=(name, folder, root, ready))
     job.start()
     assert ready.wait(120)
     return job
 
 
-def kill(context, name, folder, root, moment):
+def kill(name, folder, root, moment):
     """Start a job and kill it after so many seconds; its exit code is 0 if it had ended before."""
-    job = start(context, name, folder, root)
+    job = start(name, folder, root)
     job.join(moment)
     job.kill()
     job.join()
     return job
 
 
-def finish(job, folder):
-    job.join(300)
-    assert job.exitcode == 0, (folder.parent / f"{folder.name}.log").read_text()[-3000:]
-
-
 @pytest.fixture(scope="module", params=JOBS)
-def undisturbed(request, context, root, tmp_path_factory):
+def undisturbed(request, root, tmp_path_factory):
     """A job's name, what it leaves when nobody kills it, and the seconds that it takes."""
     folder = tmp_path_factory.mktemp(request.param) / "job"
-    job = start(context, request.param, folder, root)
+    job = start(request.param, folder, root)
     begin = time.monotonic()
-    finish(job, folder)
+    finish(job, folder.parent / "job.log")
     left = outcome(folder)
     assert any(left)
     return request.param, left, time.monotonic() - begin
@@ -83,18 +70,18 @@ def finished_files(folder):
 
 
 @pytest.mark.parametrize("seed", range(NUM_KILLS))
-def test_a_killed_job_loses_nothing_that_was_done(undisturbed, context, root, tmp_path, seed):
+def test_a_killed_job_loses_nothing_that_was_done(undisturbed, root, tmp_path, seed):
     name, expected, seconds = undisturbed
     folder, moment = tmp_path / "job", random.Random(f"{name} {seed}").uniform(0.0, seconds)
-    job = kill(context, name, folder, root, moment)
+    job = kill(name, folder, root, moment)
     while job.exitcode == 0:  # it was faster than when nobody disturbed it
         shutil.rmtree(folder)
         moment /= 2
-        job = kill(context, name, folder, root, moment)
+        job = kill(name, folder, root, moment)
     assert job.exitcode == -signal.SIGKILL
     done = finished_files(folder)
     print(f"{name}, seed {seed}: killed after {moment:.2f} of {seconds:.2f} s, {len(done)} files were there")
-    finish(start(context, name, folder, root), folder)
+    finish(start(name, folder, root), tmp_path / "job.log")
     assert outcome(folder) == expected
     again = finished_files(folder)
     assert {path: again[path] for path in done} == done  # nothing was made twice
