@@ -22,7 +22,9 @@ def test_everything_small(monkeypatch, tmp_path, capsys):
         warnings.filterwarnings("default", module="hydra")
         run_app(
             monkeypatch,
-            *("quick=true", "measure.repeats=2", "measure.warmup=0", "references.kmeans=true"),
+            *("quick=true", "measure.repeats=2", "measure.warmup=0", "measure.seconds=0.01"),
+            *("references.kmeans=true", "references.kmeans_iterations=5", "curve_seconds=0.01"),
+            *("curves.batch=[1,2]", "curves.ransac_iterations=[50,100]", "curves.lm_iterations=[5,10]"),
             *(f"curves.{name}=[]" for name in ("templates", "words", "patches", "hypotheses")),
             f"hydra.run.dir={tmp_path}",
         )
