@@ -38,7 +38,7 @@ from foundpose.evaluation.records import (
 )
 from foundpose.evaluation.report import in_words, unanswered
 from foundpose.geometry import Camera, boxes_from_xywh, check_camera, masks_from_boxes, read_camera
-from foundpose.pipeline.results import PoseEstimates
+from foundpose.pipeline.results import PoseEstimates, PoseStatus
 from foundpose.rendering import Mesh, load_mesh
 from foundpose.representation import ObjectRepresentation
 from foundpose.utils.files import write_atomically, write_json
@@ -76,7 +76,7 @@ def estimate_picture(cfg: DictConfig, output: Path) -> None:
     representation = method.store.get(mesh, name, ProgressBars(name)).to(cfg.device)
     index = torch.zeros(1, dtype=torch.int64)
     shown = [(mesh, representation)]
-    estimates, seconds = run_pipeline(method, cfg.device, image, K, mask[None], shown, index)
+    estimates, seconds = run_pipeline(method, cfg, image, K, mask[None], shown, index)
     facts = pose_records(estimates)[0] | {"mesh": str(cfg.mesh), "image": str(cfg.image), "time": seconds}
     write_json(output / "estimate.json", facts)
     write_results(output / "results.csv", to_results([facts | {"scene_id": 0, "im_id": 0, "obj_id": 0}]))
@@ -86,8 +86,18 @@ def estimate_picture(cfg: DictConfig, output: Path) -> None:
     print(json.dumps(facts, indent=1))
     print(f"written to {output}")
     if not facts["valid"]:
-        say(f"no pose was found: {facts['status']}")
+        say(f"not found: {why_not(facts, cfg.min_confidence)}")
         sys.exit(1)
+
+
+def why_not(facts: dict[str, Any], min_confidence: float) -> str:
+    """Why an object counts as not found."""
+    if facts["status"] != PoseStatus.UNLIKELY.name:
+        return str(facts["status"])
+    return (
+        f"{facts['status']}, the pose is right with a probability of {facts['probability']:.2f} only "
+        f"(min_confidence={min_confidence})"
+    )
 
 
 def read_view(cfg: DictConfig) -> tuple[Tensor, Tensor, Tensor]:
@@ -197,7 +207,7 @@ def estimate_dataset(cfg: DictConfig, output: Path) -> None:
             index = torch.tensor([ids.index(instance.obj_id) for instance in members])
             representations = objects.representations(ids, cfg.device)
             shown = list(zip(map(objects.mesh, ids), representations, strict=True))
-            estimates, seconds = run_pipeline(method, cfg.device, image, K, masks, shown, index)
+            estimates, seconds = run_pipeline(method, cfg, image, K, masks, shown, index)
             for i, instance in enumerate(members if cfg.overlays and position % cfg.overlays == 0 else ()):
                 name = f"{scene_id:06d}_{im_id:06d}_{instance.obj_id:06d}_{i}.png"
                 write_atomically(output / "overlays" / name, estimates.draw(i).save)
@@ -223,14 +233,15 @@ def estimate_dataset(cfg: DictConfig, output: Path) -> None:
 
 def run_pipeline(
     method: Method,
-    device: str,
+    cfg: DictConfig,
     image: Tensor,
     K: Tensor,
     masks: Tensor,
     objects: list[tuple[Mesh, ObjectRepresentation]],
     object_index: Tensor,
 ) -> tuple[PoseEstimates, float]:
-    """Poses of several masks of one image, and the seconds that they took."""
+    """Poses of several masks of one image, without the improbable ones, and the seconds that they took."""
+    device = cfg.device
     with torch.no_grad(), StageTimer({"pipeline": method.pipeline}) as timer:
         estimates = method.pipeline(
             image[None].to(device),
@@ -241,7 +252,7 @@ def run_pipeline(
             object_index=object_index.to(device),
             meshes=[mesh for mesh, _ in objects],
         )
-    return estimates, timer.seconds["pipeline"]
+    return estimates.withhold(cfg.min_confidence), timer.seconds["pipeline"]
 
 
 if __name__ == "__main__":

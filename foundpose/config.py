@@ -100,7 +100,10 @@ def build_method(cfg: DictConfig) -> Method:
     query_extractor = extractor if cfg.get("corruption") is None else instantiate(cfg.corruption)(extractor)
     onboarder: Onboarder = instantiate(cfg.onboarder, extractor=extractor)
     refiner = None if cfg.get("refiner") is None else instantiate(cfg.refiner)
-    pipeline: FoundPose = instantiate(cfg.pipeline, extractor=query_extractor, refiner=refiner)
+    confidence = None if cfg.get("confidence") is None else instantiate(cfg.confidence)
+    pipeline: FoundPose = instantiate(
+        cfg.pipeline, extractor=query_extractor, refiner=refiner, confidence=confidence
+    )
     return Method(
         onboarder.to(device).eval(),
         pipeline.to(device).eval(),

@@ -15,7 +15,7 @@ from foundpose.config import build_detector, build_method, claim_run_folder, cle
 from foundpose.detection import Proposer, RegionProposer
 from foundpose.features import DenseSift, PatchExtractor
 from foundpose.geometry import PerspectiveCrop
-from foundpose.pipeline import DetectAndEstimate
+from foundpose.pipeline import DetectAndEstimate, PoseConfidence
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 GROUPS = sorted(
@@ -122,6 +122,10 @@ def test_every_option_is_instantiated_and_has_the_keys_and_defaults_of_its_const
         assert isinstance(instantiate(cfg.extractor), PatchExtractor)
         assert cfg.descriptors.sigma == "auto" or cfg.descriptors.sigma > 0
         assert cfg.crop.background in ("keep", "black")
+    elif group == "confidence":  # those of an extractor come with it
+        assert (option == "none") == (cfg.confidence is None)
+        assert option == "none" or cfg.confidence == load("config", f"extractor={option}").confidence
+        assert option == "none" or isinstance(instantiate(cfg.confidence), PoseConfidence)
     elif group in MODULES:
         assert instantiate(cfg[group]) is not None
     elif group == "data":

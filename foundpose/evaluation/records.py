@@ -9,7 +9,7 @@ from torch import Tensor
 
 from foundpose.bop import Instance, PoseResult
 from foundpose.geometry import make_transform
-from foundpose.pipeline.results import PoseEstimates, PoseStatus
+from foundpose.pipeline.results import PoseEstimates, PoseEvidence, PoseStatus
 
 
 def pose_records(estimates: PoseEstimates) -> list[dict[str, Any]]:
@@ -21,7 +21,7 @@ def pose_records(estimates: PoseEstimates) -> list[dict[str, Any]]:
     Returns:
         B records: ``valid``, ``status`` (name), ``score``, ``num_inliers``, ``num_patches`` of the crop, ``R`` (3
         rows) and ``t`` (mesh units) of the pose in the camera's frame, ``templates`` with their ``similarities``, and
-        the ``best`` of them.
+        the ``best`` of them; with a confidence the ``probability`` that the pose is right, and its ``evidence``.
     """
     T, templates = estimates.T_camera_from_model, estimates.templates
     fields = [
@@ -54,6 +54,10 @@ def pose_records(estimates: PoseEstimates) -> list[dict[str, Any]]:
         "similarities": similarity.tolist(),
         "best": best.squeeze(1).long().tolist(),
     }
+    if estimates.probability is not None and estimates.evidence is not None:
+        columns["probability"] = estimates.probability.tolist()
+        evidence = torch.stack(estimates.evidence, dim=1).tolist()
+        columns["evidence"] = [dict(zip(PoseEvidence._fields, row, strict=True)) for row in evidence]
     return [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
 
 

@@ -31,9 +31,11 @@ from foundpose.evaluation.detecting import Pictures, detect_dataset
 from foundpose.evaluation.module import PoseEvaluation, estimate_dataset
 from foundpose.evaluation.objects import DatasetObjects
 from foundpose.evaluation.records import to_results
+from foundpose.evaluation.reliability import dataset_reliability
 from foundpose.evaluation.report import Estimated, all_records, in_words, merge_shards, timing, unanswered
 from foundpose.utils.files import write_json
 from foundpose.utils.progress import ProgressBars
+from foundpose.visualization.reliability import save_reliability_diagram
 
 
 def run_evaluation(cfg: DictConfig, output: Path) -> Scores | None:
@@ -180,6 +182,12 @@ def _score(
         )
         content["detection_6d"] = precision.to_json()
         print(f"6D detection:\n{precision.table()}")
+    trust = None if records is None else dataset_reliability(dataset, records)
+    if trust is not None:
+        content["confidence"] = trust.to_json()
+        bins = (trust.probability.tolist(), trust.share.tolist(), trust.count.tolist())
+        save_reliability_diagram(output / "reliability.png", *bins)
+        print(trust.table())
     write_json(output / "scores.json", content)
     print(in_words(missing))
     return scores

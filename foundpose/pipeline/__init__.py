@@ -1,5 +1,7 @@
 """The composed method: crop, describe, retrieve, match, solve, choose, refine."""
 
+from foundpose.pipeline.calibration import Reliability, fit_confidence, reliability
+from foundpose.pipeline.confidence import RIGHT_PIXELS, PoseConfidence, pose_evidence
 from foundpose.pipeline.finding import DetectAndEstimate, FoundInstances
 from foundpose.pipeline.foundpose import FoundPose
 from foundpose.pipeline.hypotheses import HypothesisMaker, MatchAndSolve, TemplateHypotheses
@@ -8,12 +10,14 @@ from foundpose.pipeline.results import (
     Correspondences,
     Hypothesised,
     PoseEstimates,
+    PoseEvidence,
     PoseHypotheses,
     PoseStatus,
 )
 from foundpose.pipeline.verification import HypothesisScorer, InlierScore, PatchVerification
 
 __all__ = [
+    "RIGHT_PIXELS",
     "Correspondences",
     "DetectAndEstimate",
     "FoundInstances",
@@ -24,9 +28,15 @@ __all__ = [
     "InlierScore",
     "MatchAndSolve",
     "PatchVerification",
+    "PoseConfidence",
     "PoseEstimates",
+    "PoseEvidence",
     "PoseHypotheses",
     "PoseStatus",
+    "Reliability",
     "TemplateHypotheses",
+    "fit_confidence",
+    "pose_evidence",
+    "reliability",
     "select_query_patches",
 ]

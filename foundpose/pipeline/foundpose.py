@@ -7,6 +7,7 @@ from torch import Tensor, nn
 
 from foundpose.features.base import PatchExtractor
 from foundpose.geometry import Crops, PerspectiveCrop
+from foundpose.pipeline.confidence import PoseConfidence, pose_evidence
 from foundpose.pipeline.hypotheses import HypothesisMaker
 from foundpose.pipeline.query import describe_query
 from foundpose.pipeline.refining import RefineWhat, refine_estimates
@@ -32,6 +33,7 @@ class FoundPose(nn.Module):
         refine: "best": refine the best hypothesis. "all", or a number: refine those of all retrieved templates, or so
             many with the best scores, and keep the one whose refined pose is best: by the hypotheses' scorer, or by
             the refiner's own score where that looks at inliers only.
+        confidence: says how probable it is that a pose is right; None: nothing does.
     """
 
     def __init__(
@@ -42,6 +44,7 @@ class FoundPose(nn.Module):
         hypotheses: HypothesisMaker,
         refiner: PoseRefiner | None = None,
         refine: RefineWhat = "best",
+        confidence: PoseConfidence | None = None,
     ) -> None:
         super().__init__()
         if refine not in ("best", "all") and not (isinstance(refine, int) and refine >= 1):
@@ -52,6 +55,7 @@ class FoundPose(nn.Module):
         self.hypotheses = hypotheses
         self.refiner = refiner
         self.refine: RefineWhat = refine
+        self.confidence = confidence
         self._checks = ExtractorChecks()
 
     def forward(
@@ -113,9 +117,15 @@ class FoundPose(nn.Module):
             templates = groups.map(lambda obj, rows: self.retriever(take_rows(query, rows), obj))
             found = self.hypotheses(templates, observation)
             estimates = choose_coarse(observation, templates, found)
-            if self.refiner is None:
+            if self.refiner is not None:
+                estimates = refine_estimates(
+                    estimates, observation, self.hypotheses, self.refiner, self.refine
+                )
+            if self.confidence is None:
                 return estimates
-            return refine_estimates(estimates, observation, self.hypotheses, self.refiner, self.refine)
+            evidence = pose_evidence(estimates, observation)
+            probability = self.confidence(evidence) * estimates.valid
+            return estimates._replace(probability=probability, evidence=evidence)
 
     @property
     def needs_meshes(self) -> bool:

@@ -16,7 +16,10 @@ if TYPE_CHECKING:
 
 
 class PoseStatus(IntEnum):
-    """Why a crop has no pose. The codes of :class:`PnpStatus` keep their values."""
+    """Why a crop has no pose. The codes of :class:`PnpStatus` keep their values.
+
+    UNLIKELY: there is a pose, but :meth:`PoseEstimates.withhold` holds it back.
+    """
 
     OK = PnpStatus.OK
     TOO_FEW_CORRESPONDENCES = PnpStatus.TOO_FEW_CORRESPONDENCES
@@ -26,6 +29,7 @@ class PoseStatus(IntEnum):
     UNUSABLE_MASK = 100
     NO_PATCHES = 101
     NO_TEMPLATE = 102
+    UNLIKELY = 103
 
 
 class Correspondences(NamedTuple):
@@ -84,6 +88,29 @@ class Hypothesised(NamedTuple):
     candidates: PoseCandidates | None = None
 
 
+class PoseEvidence(NamedTuple):
+    """What speaks for a pose of each of B crops.
+
+    Attributes:
+        inliers: (B,) share of the crop's patches that are inliers.
+        similarity: (B,) how much the crop's patches look like those of the nearest template that the pose puts on
+            them, see :class:`~foundpose.pipeline.verification.Agreement`.
+        coverage: (B,) intersection over union of the patches that the pose covers and the mask's, see there.
+        alignment: (B,) mean cosine between the nearest template's patches and the crop's feature map where the pose
+            puts them, of those on the mask; one minus it is the featuremetric cost. 0 where there are none.
+        consensus: (B,) how much the other hypotheses agree: mean of exp(−d / a tenth of the crop), with d the largest
+            distance of the projections of six points around the object; 0 without others.
+        size: (B,) log2 of the object's diameter in pixels of an image 640 px wide, over 100 px.
+    """
+
+    inliers: Tensor
+    similarity: Tensor
+    coverage: Tensor
+    alignment: Tensor
+    consensus: Tensor
+    size: Tensor
+
+
 class PoseEstimates(NamedTuple):
     """Poses of a batch of crops, and what they were made from.
 
@@ -106,6 +133,8 @@ class PoseEstimates(NamedTuple):
         candidates: with a soft selection in the PnP stage, the hypotheses of all templates and samples with the
             probability of choosing each (``T_camera_from_model`` (B, h · J, 4, 4)); None without.
         refined: what the refiner made of the hypotheses that it was given, in the crop's frame; None without.
+        probability: (B,) that the pose is right, by the pipeline's confidence; 0 where it is not valid. None without.
+        evidence: what the probability follows from; None without.
         observation: what they were made from, for figures.
     """
 
@@ -123,7 +152,20 @@ class PoseEstimates(NamedTuple):
     correspondences: Correspondences | None = None
     candidates: PoseCandidates | None = None
     refined: PoseProposals | None = None
+    probability: Tensor | None = None
+    evidence: PoseEvidence | None = None
     observation: Observation | None = None
+
+    def withhold(self, min_probability: float) -> "PoseEstimates":
+        """The same with poses that are less probable marked as not valid, with the status ``UNLIKELY``.
+
+        Without probabilities nothing changes.
+        """
+        if self.probability is None:
+            return self
+        unlikely = self.valid & (self.probability.detach() < min_probability)
+        status = self.status.masked_fill(unlikely, int(PoseStatus.UNLIKELY))
+        return self._replace(valid=self.valid & ~unlikely, status=status)
 
     def draw(self, index: int, T_true: Tensor | None = None, note: str = "") -> "Image":
         """A picture that tells how a pose came about: :func:`foundpose.pipeline.figure.draw_estimate`."""

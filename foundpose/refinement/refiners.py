@@ -64,7 +64,9 @@ class FeaturemetricRefiner(PoseRefiner):
             problem = problem._replace(sizes=self._sizes(observation.groups).to(T).repeat_interleave(n))
         if self.mask_margin is not None:
             masks = observation.crops.masks
-            problem = problem._replace(valid=problem.valid & _on_mask(T, problem, masks, self.mask_margin))
+            problem = problem._replace(
+                valid=problem.valid & patches_on_mask(T, problem, masks, self.mask_margin)
+            )
         result = self.alignment(T, problem)
         moved = proposals.valid.flatten() & ~result.failed
         score = torch.where(moved, 1.0 - result.relative_cost, torch.zeros_like(result.cost))
@@ -83,7 +85,7 @@ class FeaturemetricRefiner(PoseRefiner):
         return torch.tensor(sizes)[groups.object_index]
 
 
-def _on_mask(T: Tensor, problem: AlignmentProblem, masks: Tensor, margin: float) -> Tensor:
+def patches_on_mask(T: Tensor, problem: AlignmentProblem, masks: Tensor, margin: float) -> Tensor:
     """Which patches (n, P) poses (n, 4, 4) put on the crops' masks (B, S, S), or less than ``margin`` pixels away."""
     with torch.no_grad():
         points = transform_points(T, problem.points_model)

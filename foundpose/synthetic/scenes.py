@@ -21,6 +21,8 @@ from foundpose.geometry import (
 )
 from foundpose.rendering import Mesh, RaycastRenderer, Renderer
 
+_HIDDEN = 0.12
+
 
 class SyntheticScene(NamedTuple):
     """A picture with known truth.
@@ -136,7 +138,7 @@ def cluttered_scene(
     seed: int,
     height: int = 480,
     width: int = 640,
-    occlusion: bool = True,
+    occlusion: bool | float = True,
     renderer: Renderer | None = None,
     light: LightVariation | None = None,
 ) -> SyntheticScene:
@@ -147,7 +149,7 @@ def cluttered_scene(
         seed: of everything that is random.
         height: of the picture in pixels.
         width: of the picture in pixels.
-        occlusion: hide a corner of the object.
+        occlusion: hide a corner of the object, an eighth of it or such a share.
         renderer: draws the object; by default a ray caster with much ambient light.
         light: how much the light varies; the share of ambient light is then the light's, not the renderer's. The
             object, its pose and the clutter stay what they are without.
@@ -179,7 +181,8 @@ def cluttered_scene(
     mask = render.mask[0]
     image = torch.where(mask, shown, _clutter(height, width, generator, shapes=150))
     if occlusion:
-        image, mask = _hide_corner(image, mask, generator)
+        share = _HIDDEN if occlusion is True else occlusion
+        image, mask = _hide_corner(image, mask, generator, share)
     gain = torch.tensor([uniform(0.85, 1.1) for _ in range(3)])[:, None, None]
     noise = 0.015
     if light is not None:
@@ -232,12 +235,14 @@ def _clutter(height: int, width: int, generator: torch.Generator, shapes: int) -
     return torch.from_numpy(np.asarray(picture, dtype=np.float32) / 255.0).permute(2, 0, 1)
 
 
-def _hide_corner(image: Tensor, mask: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Put a flat shape over about an eighth of the object."""
+def _hide_corner(
+    image: Tensor, mask: Tensor, generator: torch.Generator, share: float
+) -> tuple[Tensor, Tensor]:
+    """Put a flat shape over about such a share of the object."""
     rows, columns = torch.nonzero(mask, as_tuple=True)
     angle = 2 * math.pi * float(torch.rand((), generator=generator))
     along = columns * math.cos(angle) + rows * math.sin(angle)
-    hidden = along > along.float().quantile(0.88)
+    hidden = along > along.float().quantile(1.0 - share)
     cover = torch.zeros_like(mask)
     cover[rows[hidden], columns[hidden]] = True
     cover = F.max_pool2d(cover.float()[None], 9, stride=1, padding=4)[0] > 0

@@ -8,6 +8,7 @@ from foundpose.training.adapter.evaluation import evaluate_scenes
 from foundpose.training.adapter.pairs import PairBatch, PairSettings, PatchPairs, make_pairs
 from foundpose.training.adapter.training import AdapterTraining, PairLoss, PairPoses
 from foundpose.training.base import EpochShuffle, RenderedDataModule
+from foundpose.training.confidence import ConfidencePictures, collect_evidence
 from foundpose.training.errors import PoseErrors, compare, summarize
 from foundpose.training.refiner.data import (
     Perturbation,
@@ -28,6 +29,7 @@ from foundpose.training.views import (
 
 __all__ = [
     "AdapterTraining",
+    "ConfidencePictures",
     "EpochShuffle",
     "PairBatch",
     "PairDataModule",
@@ -46,6 +48,7 @@ __all__ = [
     "RenderedDataModule",
     "TemplateViews",
     "TrueCrops",
+    "collect_evidence",
     "compare",
     "disentangled_error",
     "evaluate_refiner",

@@ -1,4 +1,5 @@
 import json
+import math
 import re
 import runpy
 import shutil
@@ -185,13 +186,31 @@ def test_missing_weights_say_how_to_get_them(own_picture, monkeypatch, tmp_path,
     assert "\\n" not in message
 
 
+def test_an_improbable_pose_is_not_found(own_picture, monkeypatch, tmp_path, capsys):
+    """A calibration that believes nothing; without a least probability the pose is shown all the same."""
+    folder, _, _, arguments = own_picture
+    unbelieving = ["+confidence._target_=foundpose.pipeline.PoseConfidence", "+confidence.weights={}"]
+    arguments = [*arguments, f"mask={folder / 'mask.png'}", *unbelieving, "+confidence.bias=-3"]
+    with pytest.raises(SystemExit) as stop:
+        run_app(monkeypatch, "estimate", *arguments, f"hydra.run.dir={tmp_path / 'held'}")
+    assert stop.value.code == 1
+    message = "not found: UNLIKELY, the pose is right with a probability of 0.05 only (min_confidence=0.5)"
+    assert message in capsys.readouterr().err
+    facts = json.loads((tmp_path / "held" / "estimate.json").read_text())
+    assert (facts["valid"], facts["status"]) == (False, "UNLIKELY")
+    assert facts["probability"] == pytest.approx(1 / (1 + math.exp(3)))
+    assert read_results(tmp_path / "held" / "results.csv") == []
+    run_app(monkeypatch, "estimate", *arguments, "min_confidence=0", f"hydra.run.dir={tmp_path / 'shown'}")
+    assert len(read_results(tmp_path / "shown" / "results.csv")) == 1
+
+
 def test_a_picture_without_a_pose_is_a_failure(own_picture, monkeypatch, tmp_path, capsys):
     _, _, _, arguments = own_picture
     # A single pixel is no region to look at.
     with pytest.raises(SystemExit) as stop:
         run_app(monkeypatch, "estimate", *arguments, "box=[5,5,1,1]", f"hydra.run.dir={tmp_path}")
     assert stop.value.code == 1
-    assert "no pose was found: UNUSABLE_MASK" in capsys.readouterr().err
+    assert "not found: UNUSABLE_MASK" in capsys.readouterr().err
     assert json.loads((tmp_path / "estimate.json").read_text())["valid"] is False
     assert read_results(tmp_path / "results.csv") == []
 
