@@ -50,7 +50,9 @@ def find_in_pictures(cfg: DictConfig, output: Path) -> bool:
     claim_run_folder(output, cfg, ("step",))
     method = build_method(cfg)
     detector = build_detector(cfg, method.onboarder.extractor)
-    finder: DetectAndEstimate = instantiate(cfg.finder, detector=detector, pipeline=method.pipeline).eval()
+    finder: DetectAndEstimate = instantiate(
+        cfg.finder, detector=detector, pipeline=method.pipeline, min_probability=cfg.min_confidence
+    ).eval()
     objects = [
         method.store.get(mesh, path.stem, ProgressBars(path.stem)).to(cfg.device)
         for mesh, path in zip(meshes, paths, strict=True)

@@ -38,6 +38,7 @@ class DetectAndEstimate(nn.Module):
         detector: finds regions.
         pipeline: estimates poses; its extractor must be the detector's.
         spacing: instances of one object are at least so many diameters apart.
+        min_probability: poses that are right with less are no instances; for a pipeline with a confidence.
         batch_size: poses that are estimated at a time.
     """
 
@@ -46,6 +47,7 @@ class DetectAndEstimate(nn.Module):
         detector: Detector,
         pipeline: FoundPose,
         spacing: float = 0.3,
+        min_probability: float = 0.0,
         batch_size: int = 16,
     ) -> None:
         super().__init__()
@@ -54,6 +56,7 @@ class DetectAndEstimate(nn.Module):
         self.detector = detector
         self.pipeline = pipeline
         self.spacing = spacing
+        self.min_probability = min_probability
         self.batch_size = batch_size
 
     def forward(
@@ -101,7 +104,7 @@ class DetectAndEstimate(nn.Module):
         with torch.no_grad():
             for rows in torch.arange(len(found.score)).split(self.batch_size):
                 estimates = estimate(rows)
-                valid.append(estimates.valid)
+                valid.append(estimates.withhold(self.min_probability).valid)
                 score.append(estimates.score)
                 T.append(estimates.T_camera_from_model)
         of_poses = torch.cat(score) * torch.cat(valid)

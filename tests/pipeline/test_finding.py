@@ -7,6 +7,7 @@ from foundpose.detection import CropScorer, Detector, Pictures, Proposals, Propo
 from foundpose.features import CoordinateCode
 from foundpose.geometry import PerspectiveCrop, intrinsics_matrix, make_transform, rotation_angle
 from foundpose.matching import PatchMatcher
+from foundpose.pipeline import PoseConfidence
 from foundpose.pnp import RansacPnp
 from foundpose.rendering import CoordinateRenderer
 from foundpose.rendering.coordinates import render_coordinate_image
@@ -92,6 +93,17 @@ def test_as_many_as_asked_for(scene, oracle_blob) -> None:
 def test_nothing_to_be_found(scene, oracle_blob) -> None:
     image, masks, _ = scene
     assert finder(masks[:0])(image[None], K[None], oracle_blob) is None
+
+
+@torch.no_grad()
+def test_improbable_poses_are_no_instances(scene, oracle_blob) -> None:
+    image, masks, _ = scene
+    found = finder(masks)
+    found.pipeline.confidence = PoseConfidence({}, -1.0)  # every pose: 27 %
+    found.min_probability = 0.3
+    assert found(image[None], K[None], oracle_blob) is None
+    found.min_probability = 0.2
+    assert found(image[None], K[None], oracle_blob) is not None
 
 
 def test_gradients_reach_the_picture(scene, oracle_blob) -> None:

@@ -89,13 +89,16 @@ def test_evidence_and_what_is_right(blob, oracle_blob):
 
 
 def test_the_app_fits_and_its_numbers_can_be_used(tmp_path, monkeypatch, capsys):
-    """Two procedural objects under SIFT; what is there already is not made again."""
+    """Two procedural objects in true coordinates, some absent; what is there already is not made again."""
     arguments = [
-        "extractor=dense_sift",
+        "experiment=oracle",
         *SMALL,
         "meshes=2",
         "pictures_per_mesh=8",
-        "+scene_renderer.supersampling=1",
+        "scene_renderer._target_=foundpose.rendering.CoordinateRenderer",
+        "~scene_renderer.ambient",
+        *(f"pictures_drawn.light.{name}=[1,1]" for name in ("ambient", "brightness", "gain")),
+        "pictures_drawn.light.noise=[0,0]",
         "pictures_drawn.absent=0.4",
         "pictures_drawn.heights=[300,400]",
         f"representations={tmp_path / 'representations'}",
