@@ -1,7 +1,5 @@
 import numpy as np
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from sklearn.cluster import AgglomerativeClustering, ward_tree
 from sklearn.feature_extraction.image import grid_to_graph
 from torch import Tensor
@@ -38,20 +36,22 @@ def cut(tree: RegionTree, cells: int, count: int) -> np.ndarray:
     return root[:cells]
 
 
-@settings(max_examples=20)
-@given(st.integers(0, 10_000), st.integers(2, 7), st.integers(2, 7))
-def test_merges_as_ward_does_with_the_same_neighbours(seed: int, height: int, width: int) -> None:
-    features = torch.randn(3, height, width, generator=torch.Generator().manual_seed(seed)).double()
-    tree = region_tree(features[None])
-    cells = height * width
-    assert len(tree.parent) == 2 * cells - 1
-    children, *_ = ward_tree(features.flatten(1).T.numpy(), connectivity=grid_graph(height, width))
-    theirs = [{i} for i in range(cells)]
-    for a, b in children:
-        theirs.append(theirs[a] | theirs[b])
-    # With the restriction to neighbours the order of merges can matter, but seldom does.
-    both = members(tree, cells) & set(map(frozenset, theirs))
-    assert len(both) >= 0.75 * (2 * cells - 1)
+def test_merges_as_ward_does_with_the_same_neighbours() -> None:
+    """With the restriction to neighbours the order of merges can matter, but seldom does."""
+    shares = []
+    for seed in range(20):
+        generator = torch.Generator().manual_seed(seed)
+        height, width = torch.randint(2, 8, (2,), generator=generator).tolist()
+        features = torch.randn(3, height, width, generator=generator).double()
+        tree = region_tree(features[None])
+        cells = height * width
+        assert len(tree.parent) == 2 * cells - 1
+        children, *_ = ward_tree(features.flatten(1).T.numpy(), connectivity=grid_graph(height, width))
+        theirs = [{i} for i in range(cells)]
+        for a, b in children:
+            theirs.append(theirs[a] | theirs[b])
+        shares.append(len(members(tree, cells) & set(map(frozenset, theirs))) / (2 * cells - 1))
+    assert np.mean(shares) > 0.9
 
 
 def test_regions_of_one_value_are_found() -> None:

