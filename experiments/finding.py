@@ -138,6 +138,10 @@ def _names(source: Path) -> list[str] | None:
         names = sorted(path.name for path in source.iterdir() if path.suffix.lower() in PICTURES)
         if not names:
             raise FileNotFoundError(f"no picture in {source}: none of its files ends in {sorted(PICTURES)}")
+        stems = Counter(Path(name).stem for name in names)
+        twice = sorted(name for name in names if stems[Path(name).stem] > 1)
+        if twice:
+            raise ValueError(f"results are named after the pictures, and {twice} have one name: rename some")
         return names
     return None if source.suffix.lower() in VIDEOS else [source.name]
 

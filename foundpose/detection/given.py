@@ -28,7 +28,7 @@ class FileProposer(Proposer):
     def __init__(self, path: str | Path) -> None:
         super().__init__()
         self.path = Path(path)
-        self._regions: dict[tuple[int, int], list[tuple[str, dict[str, Any]]]] = defaultdict(list)
+        self._regions: dict[object, list[tuple[str, dict[str, Any]]]] = defaultdict(list)
         entries = read_json(self.path)
         if not isinstance(entries, list):
             raise BopError(f"{path} must hold a JSON list of regions, it holds {type(entries).__name__}")
@@ -57,7 +57,7 @@ class FileProposer(Proposer):
         device = pictures.images.device
         masks, scores = [], []
         for name in pictures.names:
-            regions = self._regions.get(name, [])  # type: ignore[call-overload]
+            regions = self._regions.get(name, [])
             mask = torch.zeros(len(regions), height, width, dtype=torch.bool)
             for place, (where, entry) in enumerate(regions):
                 if "segmentation" in entry:

@@ -47,14 +47,16 @@ def detect_dataset(
     """
     dataset = objects.dataset
     ids = sorted(object_ids)
-    representations = objects.representations(ids, next(detector.extractor.buffers()).device)
+    # An extractor may have neither parameters nor buffers.
+    held = (*detector.parameters(), *detector.buffers())
+    device = held[0].device if held else torch.device("cpu")
+    representations = objects.representations(ids, device)
     entries: list[dict[str, Any]] = []
     for done, (scene_id, im_id) in enumerate(images, start=1):
         path = folder / "detections" / f"{scene_id:06d}_{im_id:06d}.json"
         if not path.is_file():
             image = pictures(dataset, scene_id, im_id)[None]
             K = dataset.intrinsics(scene_id, im_id).float()[None]
-            device = representations[0].words.device
             start = time.perf_counter()
             with torch.no_grad():
                 found = detector(image.to(device), K.to(device), representations, [(scene_id, im_id)])

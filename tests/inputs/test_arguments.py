@@ -111,6 +111,13 @@ def test_any_value_is_used_or_refused_where_objects_are_found(folder, changed):
     assert "Traceback" not in told.getvalue()
 
 
+def test_two_pictures_of_one_name_are_refused(tmp_path):
+    for name in ("a.png", "a.jpg"):
+        Image.new("RGB", (8, 8)).save(tmp_path / name)
+    with pytest.raises(ValueError, match="have one name: rename some"):
+        finding._names(tmp_path)
+
+
 def _accepted(_cfg):
     raise AcceptedError
 
