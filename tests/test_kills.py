@@ -1,6 +1,7 @@
 """Jobs that are killed at random moments and started again.
 
-Each is killed at two moments, and with ``FOUNDPOSE_ALL_KILLS=1`` in the environment at twenty.
+Each is killed at two moments, and with ``FOUNDPOSE_ALL_KILLS=1`` in the environment at twenty. Those that run apps
+are among the slow tests.
 """
 
 import json
@@ -44,7 +45,13 @@ def kill(name, folder, root, moment):
     return job
 
 
-@pytest.fixture(scope="module", params=JOBS)
+APPS = ("evaluation", "ablation")
+
+
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param(name, marks=[pytest.mark.slow] if name in APPS else []) for name in JOBS],
+)
 def undisturbed(request, root, tmp_path_factory):
     """A job's name, what it leaves when nobody kills it, and the seconds that it takes."""
     folder = tmp_path_factory.mktemp(request.param) / "job"

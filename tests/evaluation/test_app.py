@@ -83,6 +83,7 @@ def test_a_run_from_detections_to_scores(reference):
     assert [r["detection_score"] for r in records] == [0.9] * NUM_IMAGES
 
 
+@pytest.mark.slow
 def test_two_processes_share_the_work_and_agree_on_a_size(arguments, reference, tmp_path):
     """No instance is lost or done twice, and the results are those of one process."""
     changes = ["data_module.batch_size=auto", "trainer=ddp", "trainer.devices=2"]
@@ -103,6 +104,7 @@ def test_two_processes_share_the_work_and_agree_on_a_size(arguments, reference, 
     assert scores[0]["mspd"] == scores[1]["mspd"]
 
 
+@pytest.mark.slow
 def test_a_killed_run_goes_on(arguments, reference, root, tmp_path):
     """Kill it as soon as batches are there, twice; the end is that of the run left alone."""
     shard, log = shard_path(tmp_path, 0), tmp_path / "log"

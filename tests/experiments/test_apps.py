@@ -284,6 +284,7 @@ def test_meshes_in_another_unit_and_unknown_objects_are_refused(tiny_bop, monkey
         assert message in capsys.readouterr().err.strip().splitlines()[-1]
 
 
+@pytest.mark.slow
 def test_killed_onboarding_and_estimation_lose_nothing(tiny_bop, left_alone, tmp_path):
     """Kill the process at its first written file, start it again, and compare with a run left alone."""
     victim, log = tmp_path / "victim", tmp_path / "log"

@@ -18,6 +18,7 @@ def config(*overrides):
     return load_config("gpu_check", [*SMALL, "instances_per_image=1", *overrides])
 
 
+@pytest.mark.slow
 def test_parts_and_their_page(tmp_path):
     names = ["onboarding", "dataset", "agreement", "benchmark vits14 float32"]
     for name in names:

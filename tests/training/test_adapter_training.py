@@ -175,6 +175,7 @@ def test_what_is_logged_is_of_the_valid_pairs():
     assert logged == {"val/valid": (0.0, 2)}
 
 
+@pytest.mark.slow
 def test_training_improves_the_poses_of_unseen_objects(sift_onboarder, crop, tmp_path):
     """The claim of experiments/train_adapter.py, small: other meshes, other pictures, the true match never told."""
     settings = PairSettings(10, 2, max_degrees=40.0, light=LightVariation(), surface_points=128)

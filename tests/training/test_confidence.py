@@ -88,6 +88,7 @@ def test_evidence_and_what_is_right(blob, oracle_blob):
         collect_evidence(pipeline, oracle_blob, blob, iter(scenes))
 
 
+@pytest.mark.slow
 def test_the_app_fits_and_its_numbers_can_be_used(tmp_path, monkeypatch, capsys):
     """Two procedural objects in true coordinates, some absent; what is there already is not made again."""
     arguments = [

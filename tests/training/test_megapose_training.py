@@ -4,6 +4,7 @@ import json
 import runpy
 import sys
 
+import pytest
 import pytorch_lightning as pl
 import torch
 from hydra.utils import instantiate
@@ -16,6 +17,7 @@ from tests.bop_dataset import write_ply
 from tests.training.test_refiner_training import ROOT, SETTINGS, data_module, fit
 
 
+@pytest.mark.slow
 def test_training_lowers_the_loss(bodies, tmp_path):
     pl.seed_everything(0, verbose=False)
     renderer = RaycastRenderer(1, 1.0)

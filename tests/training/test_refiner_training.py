@@ -172,6 +172,7 @@ def test_loss_counts_what_can_be_rendered_and_reaches_all_parameters(pictures):
     assert nothing.loss == 0
 
 
+@pytest.mark.slow
 def test_training_lowers_the_loss(bodies, pictures, tmp_path):
     pl.seed_everything(0, verbose=False)
     training = new_training(learning_rate=3e-3)

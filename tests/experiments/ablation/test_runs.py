@@ -164,6 +164,7 @@ def test_a_sweep_from_the_command_line(arguments, tmp_path, monkeypatch, capsys)
     assert after == before
 
 
+@pytest.mark.slow
 def test_a_single_run_of_an_experiment(tiny_bop, representations, tmp_path, monkeypatch, capsys):
     run_app(
         monkeypatch,

@@ -16,6 +16,7 @@ def run_app(monkeypatch, *overrides):
     runpy.run_path(str(ROOT / "experiments" / "benchmark.py"), run_name="__main__")
 
 
+@pytest.mark.slow
 def test_everything_small(monkeypatch, tmp_path, capsys):
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)  # of settings that do not fit the workload
