@@ -55,7 +55,7 @@ def run(cfg: DictConfig, output: Path) -> None:
     )
     right = torch.cat([part[1] for part in found])
     measured = reliability(left_out, right)
-    confidence = fit(cfg, found)
+    confidence = fit(cfg, found, cfg.share_right)
     write_confidence(output / "confidence" / "fitted.yaml", confidence)
     write_json(
         output / "results.json", {"right": float(right.float().mean()), "left_out": measured.to_json()}
@@ -67,11 +67,13 @@ def run(cfg: DictConfig, output: Path) -> None:
     print(f"use it with: --config-dir {output} confidence=fitted")
 
 
-def fit(cfg: DictConfig, found: Sequence[tuple[PoseEvidence, Tensor]]) -> PoseConfidence:
+def fit(
+    cfg: DictConfig, found: Sequence[tuple[PoseEvidence, Tensor]], share_right: float | None = None
+) -> PoseConfidence:
     """Fit to the evidence of several objects."""
     evidence, right = zip(*found, strict=True)
     return fit_confidence(
-        PoseEvidence(*map(torch.cat, zip(*evidence, strict=True))), torch.cat(right), cfg.decay
+        PoseEvidence(*map(torch.cat, zip(*evidence, strict=True))), torch.cat(right), cfg.decay, share_right
     )
 
 

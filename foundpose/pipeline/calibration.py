@@ -1,5 +1,6 @@
 """Fitting probabilities to what turned out right, and saying how far they can be trusted."""
 
+import math
 from typing import Any, NamedTuple
 
 import torch
@@ -9,19 +10,28 @@ from foundpose.pipeline.confidence import PoseConfidence
 from foundpose.pipeline.results import PoseEvidence
 
 
-def fit_confidence(evidence: PoseEvidence, right: Tensor, decay: float = 1.0) -> PoseConfidence:
+def fit_confidence(
+    evidence: PoseEvidence, right: Tensor, decay: float = 1.0, share_right: float | None = None
+) -> PoseConfidence:
     """Logistic regression by Newton's method.
 
     Args:
         evidence: of N poses.
         right: (N,) bool, which of them are right.
         decay: half the factor of the squared weights of standardised evidence, beside the sum over all poses.
+        share_right: share of poses that are right where the confidence will be used, if it is known to differ: what
+            a right pose looks like is taken to be the same there, so that only the bias moves, by the difference of
+            log odds.
 
     Raises:
-        ValueError: all poses are right, or none; or evidence that is not finite.
+        ValueError: all poses are right, or none; evidence that is not finite; or a share that is not in (0, 1).
 
     Differentiable w.r.t. nothing.
+
+    Source: Saerens et al., "Adjusting the Outputs of a Classifier to New a Priori Probabilities", 2002 (the share).
     """
+    if share_right is not None and not 0 < share_right < 1:
+        raise ValueError(f"share_right must be between 0 and 1, got {share_right}")
     if bool(right.all()) or not bool(right.any()):
         raise ValueError(f"{int(right.sum())} of {len(right)} poses are right: both kinds are needed to fit")
     x = torch.stack(evidence, dim=1).double()
@@ -43,7 +53,12 @@ def fit_confidence(evidence: PoseEvidence, right: Tensor, decay: float = 1.0) ->
             break
     weights = w[:-1] / spread
     names = dict(zip(PoseEvidence._fields, weights.tolist(), strict=True))
-    return PoseConfidence(names, float(w[-1] - weights @ mean))
+    moved = 0.0 if share_right is None else _log_odds(share_right) - _log_odds(float(right.double().mean()))
+    return PoseConfidence(names, float(w[-1] - weights @ mean) + moved)
+
+
+def _log_odds(share: float) -> float:
+    return math.log(share / (1.0 - share))
 
 
 class Reliability(NamedTuple):

@@ -165,6 +165,21 @@ def test_the_fit_equals_scikit_learns():
     assert float((fitted(evidence) - truth).abs().mean()) < 0.06
 
 
+def test_another_share_of_right_poses_moves_the_bias():
+    """Poses drawn so that more are right than in those of the fit, with the same evidence for each kind."""
+    evidence, right, _ = made_up(20_000)
+    keep = right | (torch.rand(len(right), generator=torch.Generator().manual_seed(1)) < 0.25)
+    more = PoseEvidence(*(part[keep] for part in evidence))
+    share = float(right[keep].double().mean())
+    adapted = fit_confidence(evidence, right, share_right=share)
+    plain = fit_confidence(evidence, right)
+    assert torch.equal(adapted.weight, plain.weight)
+    assert reliability(adapted(more), right[keep]).error < 0.02 < reliability(plain(more), right[keep]).error
+    assert float(adapted(more).mean()) == pytest.approx(share, abs=0.01)
+    with pytest.raises(ValueError, match="share_right must be between 0 and 1, got 1"):
+        fit_confidence(evidence, right, share_right=1)
+
+
 def test_a_fit_needs_both_kinds():
     evidence, right, _ = made_up(20)
     with pytest.raises(ValueError, match="20 of 20 poses are right"):
