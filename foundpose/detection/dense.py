@@ -1,6 +1,7 @@
 """Descriptors of all patches of a picture."""
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -44,33 +45,38 @@ class DensePatches(nn.Module):
     patches at a tile's edge, which see little of what surrounds them, are taken from its neighbour.
 
     Args:
-        scale: enlargement of the picture.
+        scales: enlargements of the picture; for each there is a map.
         size: side of a tile in pixels.
         margin: patches at a tile's edge that are left to its neighbours.
         batch_size: tiles that are described at a time.
     """
 
-    def __init__(self, scale: float = 2.0, size: int = 420, margin: int = 3, batch_size: int = 8) -> None:
+    def __init__(
+        self, scales: Sequence[float] = (2.0,), size: int = 420, margin: int = 3, batch_size: int = 8
+    ) -> None:
         super().__init__()
-        if not scale > 0:
-            raise ValueError(f"scale must be positive, got {scale}")
+        if not scales or not all(scale > 0 for scale in scales):
+            raise ValueError(f"scales must be positive, and at least one, got {list(scales)}")
         if margin < 0:
             raise ValueError(f"margin must be at least 0 patches, got {margin}")
         if batch_size < 1:
             raise ValueError(f"batch_size must be at least 1, got {batch_size}")
-        self.scale = scale
+        self.scales = tuple(scales)
         self.size = size
         self.margin = margin
         self.batch_size = batch_size
 
-    def forward(self, images: Tensor, extractor: PatchExtractor) -> DescriptorMap:
-        """Describe the patches of pictures (N, 3, H, W) in [0, 1].
+    def forward(self, images: Tensor, extractor: PatchExtractor) -> tuple[DescriptorMap, ...]:
+        """Describe the patches of pictures (N, 3, H, W) in [0, 1]: a map for each scale.
 
         Raises:
             ValueError: the tiles are too small for their margin, or the extractor's stride is no whole number.
 
         Differentiable w.r.t. ``images`` and the extractor's parameters as far as the extractor is.
         """
+        return tuple(self._describe(images, extractor, scale) for scale in self.scales)
+
+    def _describe(self, images: Tensor, extractor: PatchExtractor, scale: float) -> DescriptorMap:
         grid = extractor.patch_grid(self.size)
         inner = grid.size - 2 * self.margin
         if inner < 1 or grid.stride != int(grid.stride):
@@ -78,9 +84,9 @@ class DensePatches(nn.Module):
                 f"tiles of {self.size} px have {grid.size} patches along a side, {grid.stride:g} px apart: margin "
                 f"({self.margin}) must leave some, and the distance must be whole"
             )
-        height, width = (round(side * self.scale) for side in images.shape[-2:])
+        height, width = (round(side * scale) for side in images.shape[-2:])
         large = F.interpolate(
-            images, (height, width), mode="bilinear", align_corners=False, antialias=self.scale < 1
+            images, (height, width), mode="bilinear", align_corners=False, antialias=scale < 1
         )
         # As many patches as fit, each described in the tile whose inner part it lies in.
         rows, columns = (
@@ -103,4 +109,4 @@ class DensePatches(nn.Module):
         described = described[..., self.margin : last, self.margin : last]
         described = described.unflatten(0, (len(images), down, across)).permute(0, 3, 1, 4, 2, 5)
         joined = described.flatten(4, 5).flatten(2, 3)[..., :rows, :columns]
-        return DescriptorMap(joined, grid.stride / self.scale, (grid.offset + 0.5) / self.scale - 0.5)
+        return DescriptorMap(joined, grid.stride / scale, (grid.offset + 0.5) / scale - 0.5)

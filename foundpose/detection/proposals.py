@@ -20,13 +20,14 @@ class Pictures(NamedTuple):
     Attributes:
         images: (N, 3, H, W) RGB in [0, 1].
         K: (N, 3, 3) intrinsics, pixels.
-        descriptors: of all patches of the pictures; None where no stage of a detector asks for them.
+        descriptors: of all patches of the pictures, at one scale or several; None where no stage of a detector asks
+            for them.
         names: of the pictures, such as BOP's (scene, image), for proposals that are kept by name.
     """
 
     images: Tensor
     K: Tensor
-    descriptors: DescriptorMap | None = None
+    descriptors: Sequence[DescriptorMap] | None = None
     names: Sequence[object] | None = None
 
 

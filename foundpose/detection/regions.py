@@ -4,7 +4,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from foundpose.detection.proposals import Pictures, Proposals, Proposer, pad_proposals
+from foundpose.detection.proposals import Pictures, Proposals, Proposer, mask_overlaps, pad_proposals
 from foundpose.detection.region_tree import RegionTree, region_tree
 
 
@@ -13,15 +13,16 @@ class RegionProposer(Proposer):
 
     The directions of the patch descriptors are reduced to their leading principal components in the picture, with the
     patches' places beside them, and merged to a tree (:func:`region_tree`). Of its regions those of a plausible size
-    are proposed; of nested ones that hardly differ, the larger.
+    are proposed; of nested ones that hardly differ, the larger. Of pictures described at several scales, each scale
+    has its tree, and a region that an earlier one has as well is proposed once.
 
     Args:
         components: number of principal components.
         position: weight of a patch's place (in patches) beside its descriptor (of standard deviation 1).
-        min_patches: of a region.
+        min_patches: of a region, at the first scale; at others so many as have the same area.
         max_share: of the picture's patches that a region may have.
         overlap: of nested regions, the smaller is left out if it has more than this share of the
-            larger one's patches.
+            larger one's patches; of regions of two scales, the later one above this intersection over union.
     """
 
     needs_descriptors = True
@@ -49,24 +50,30 @@ class RegionProposer(Proposer):
         self.overlap = overlap
 
     def forward(self, pictures: Pictures) -> Proposals:
-        """Regions of pictures, the largest first; all scores are 1.
+        """Regions of pictures; all scores are 1.
 
         Raises:
             ValueError: the pictures come without descriptors.
         """
-        described = pictures.descriptors
-        if described is None:
+        if pictures.descriptors is None:
             raise ValueError("RegionProposer needs the descriptors of the pictures (DensePatches)")
-        count, _, height, width = described.descriptors.shape
-        tree = region_tree(self._features(described.descriptors.detach().float()))
-        regions, image = _cells_of(tree, self._chosen(tree, height * width), height * width)
         size = pictures.images.shape[-2:]
-        return pad_proposals(
-            [
-                described.to_masks(regions[image == n].unflatten(1, (height, width)), *size)
-                for n in range(count)
-            ]
-        )
+        found: list[Tensor] = []
+        for described in pictures.descriptors:
+            count, _, height, width = described.descriptors.shape
+            finer = (pictures.descriptors[0].stride / described.stride) ** 2
+            tree = region_tree(self._features(described.descriptors.detach().float()))
+            nodes = self._chosen(tree, height * width, round(self.min_patches * finer))
+            regions, image = _cells_of(tree, nodes, height * width)
+            cells = [regions[image == n].unflatten(1, (height, width)) for n in range(count)]
+            masks = [described.to_masks(part, *size) for part in cells]
+            found = [self._joined(*pair) for pair in zip(found, masks, strict=True)] if found else masks
+        return pad_proposals(found)
+
+    def _joined(self, masks: Tensor, more: Tensor) -> Tensor:
+        """Masks (P, H, W) and those of another scale (Q, H, W) that are not among them."""
+        overlaps = mask_overlaps(torch.cat([masks, more]))[len(masks) :, : len(masks)]
+        return torch.cat([masks, more[~(overlaps > self.overlap).any(dim=1)]])
 
     def _features(self, descriptors: Tensor) -> Tensor:
         """What is compared (N, components + 2, h, w): components of standard deviation 1 together, and places."""
@@ -81,7 +88,7 @@ class RegionProposer(Proposer):
         places = self.position * torch.stack([columns, rows]).expand(len(x), -1, -1, -1)
         return torch.cat([x.transpose(1, 2).unflatten(2, (height, width)), places], dim=1)
 
-    def _chosen(self, tree: RegionTree, cells: int) -> list[int]:
+    def _chosen(self, tree: RegionTree, cells: int, fewest: int) -> list[int]:
         """The regions that are proposed, from the root down."""
         parent, size = tree.parent.tolist(), tree.size.tolist()
         most = self.max_share * cells
@@ -90,7 +97,7 @@ class RegionProposer(Proposer):
         for node in range(len(parent) - 1, -1, -1):
             above = kept_above[parent[node]] if parent[node] != node else 0
             kept_above[node] = above
-            fits = self.min_patches <= size[node] <= most
+            fits = fewest <= size[node] <= most
             if fits and (above == 0 or size[node] <= self.overlap * above):
                 chosen.append(node)
                 kept_above[node] = size[node]

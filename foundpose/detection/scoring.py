@@ -73,7 +73,8 @@ class TemplateMeans(nn.Module):
 class MeanDescriptorScorer(ProposalScorer):
     """Compares the mean descriptor of a region's patches with those of an object's templates.
 
-    Quick: the patches of the picture are described once for all regions and objects.
+    Quick: the patches of the picture are described once for all regions and objects; of several scales the first is
+    looked at.
 
     Args:
         views: the similarity is the mean of that to so many of the most similar templates.
@@ -99,9 +100,9 @@ class MeanDescriptorScorer(ProposalScorer):
         wanted: Tensor,
     ) -> Tensor:
         """Cosine similarity, see :class:`ProposalScorer`."""
-        described = pictures.descriptors
-        if described is None:
+        if pictures.descriptors is None:
             raise ValueError("MeanDescriptorScorer needs the descriptors of the pictures (DensePatches)")
+        described = pictures.descriptors[0]
         of_picture = []
         for patches, masks in zip(described.descriptors, proposals.masks, strict=True):
             share = described.share_of(masks).flatten(1)

@@ -10,7 +10,7 @@ from tests.detection.conftest import Colors
 
 def test_a_picture_of_one_tile_is_the_extractors(generator: torch.Generator) -> None:
     images = torch.rand(2, 3, 140, 140, generator=generator)
-    described = DensePatches(scale=1.0, size=140, margin=0)(images, Colors())
+    (described,) = DensePatches(scales=[1.0], size=140, margin=0)(images, Colors())
     torch.testing.assert_close(described.descriptors, Colors()(images).patches)
     assert (described.stride, described.offset) == (14.0, 6.5)
 
@@ -19,22 +19,31 @@ def test_a_picture_of_one_tile_is_the_extractors(generator: torch.Generator) -> 
 @pytest.mark.parametrize("size", [(224, 308), (150, 430), (70, 90)])
 def test_tiles_join_without_a_seam(margin: int, size: tuple[int, int], generator: torch.Generator) -> None:
     images = torch.rand(2, 3, *size, generator=generator)
-    described = DensePatches(scale=1.0, size=140, margin=margin, batch_size=3)(images, Colors())
+    (described,) = DensePatches(scales=[1.0], size=140, margin=margin, batch_size=3)(images, Colors())
     torch.testing.assert_close(described.descriptors[:, :3], F.avg_pool2d(images, 14))
 
 
 @pytest.mark.parametrize("scale", [2.0, 1.5])
 def test_patches_lie_where_they_say(scale: float) -> None:
     u = torch.arange(200.0).expand(3, 120, 200) / 200
-    described = DensePatches(scale=scale, size=140, margin=1)(u[None], Colors())
+    (described,) = DensePatches(scales=[scale], size=140, margin=1)(u[None], Colors())
     columns = torch.arange(described.descriptors.shape[-1])
     expected = (described.stride * columns + described.offset) / 200
     inner = slice(1, -1)
     torch.testing.assert_close(described.descriptors[0, 0, 2, inner], expected[inner], atol=1e-5, rtol=0)
 
 
+def test_several_scales_are_those_alone(generator: torch.Generator) -> None:
+    images = torch.rand(2, 3, 100, 140, generator=generator)
+    both = DensePatches(scales=[1.5, 1.0], size=140, margin=1)(images, Colors())
+    for described, scale in zip(both, (1.5, 1.0), strict=True):
+        (alone,) = DensePatches(scales=[scale], size=140, margin=1)(images, Colors())
+        assert torch.equal(described.descriptors, alone.descriptors)
+        assert described[1:] == alone[1:]
+
+
 def test_masks_of_cells_and_back() -> None:
-    described = DensePatches(scale=2.0, size=140, margin=1)(torch.zeros(1, 3, 120, 160), Colors())
+    (described,) = DensePatches(scales=[2.0], size=140, margin=1)(torch.zeros(1, 3, 120, 160), Colors())
     height, width = described.descriptors.shape[-2:]
     cells = torch.zeros(1, height, width, dtype=torch.bool)
     cells[0, 4:9, 3:12] = True
@@ -54,7 +63,7 @@ def test_margin_hides_the_edges_of_tiles(generator: torch.Generator) -> None:
             marked[..., 0, :] = marked[..., -1, :] = marked[..., :, 0] = marked[..., :, -1] = -1.0
             return PatchFeatures(marked, None)
 
-    described = DensePatches(scale=1.0, size=140, margin=1)(torch.rand(1, 3, 224, 224), Edges())
+    (described,) = DensePatches(scales=[1.0], size=140, margin=1)(torch.rand(1, 3, 224, 224), Edges())
     assert (described.descriptors >= 0).all()
 
 
@@ -63,14 +72,14 @@ def test_gradients_reach_the_picture() -> None:
         "vits14", layer=0, weights="random", seed=0, config={"hidden_size": 24, "num_attention_heads": 2}
     )
     images = torch.rand(1, 3, 60, 60, requires_grad=True)
-    DensePatches(scale=1.0, size=56, margin=0)(images, network).descriptors.square().sum().backward()
+    DensePatches(scales=[1.0], size=56, margin=0)(images, network)[0].descriptors.square().sum().backward()
     assert images.grad is not None
     assert (images.grad != 0).float().mean() > 0.5
 
 
 def test_refusals() -> None:
-    with pytest.raises(ValueError, match="scale must be positive"):
-        DensePatches(scale=0.0)
+    with pytest.raises(ValueError, match=r"scales must be positive, and at least one, got \[0.0\]"):
+        DensePatches(scales=[0.0])
     with pytest.raises(ValueError, match="margin"):
         DensePatches(margin=-1)
     with pytest.raises(ValueError, match="must leave some"):

@@ -127,7 +127,7 @@ def test_pictures_alone_as_in_a_batch(scene: Scene) -> None:
     images = torch.stack([scene.image, scene.image.flip(-1)])
     objects = [scene.objects["red"], scene.objects["blue"]]
     proposer = RegionProposer(components=4, min_patches=8)
-    dense = DensePatches(scale=2.0, size=SIDE, margin=1)
+    dense = DensePatches(scales=[2.0], size=SIDE, margin=1)
     finder = detector(
         scene.masks,
         proposer=proposer,
@@ -151,7 +151,7 @@ def test_without_a_segmenter(scene: Scene) -> None:
     finder = detector(
         scene.masks,
         proposer=RegionProposer(components=4, min_patches=8),
-        dense=DensePatches(scale=2.0, size=SIDE, margin=1),
+        dense=DensePatches(scales=[2.0], size=SIDE, margin=1),
         preselection=MeanDescriptorScorer(),
         candidates=8,
     )

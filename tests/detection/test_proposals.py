@@ -68,7 +68,7 @@ def test_boxes() -> None:
 
 
 def test_regions_find_the_objects(scene: Scene) -> None:
-    dense = DensePatches(scale=2.0, size=140, margin=1)
+    dense = DensePatches(scales=[2.0], size=140, margin=1)
     pictures = Pictures(scene.image[None], K[None], dense(scene.image[None], Colors()))
     proposals = RegionProposer(components=4, min_patches=8)(pictures)
     assert bool(proposals.valid.all())
@@ -82,7 +82,10 @@ def test_regions_find_the_objects(scene: Scene) -> None:
 
 def test_regions_alone_as_in_a_batch(scene: Scene) -> None:
     images = torch.stack([scene.image, scene.image.flip(-1)])
-    dense, proposer = DensePatches(scale=1.0, size=140, margin=1), RegionProposer(components=4, min_patches=4)
+    dense, proposer = (
+        DensePatches(scales=[1.0], size=140, margin=1),
+        RegionProposer(components=4, min_patches=4),
+    )
     together = proposer(Pictures(images, K.expand(2, 3, 3), dense(images, Colors())))
     for n in range(2):
         one = images[n : n + 1]
@@ -90,9 +93,27 @@ def test_regions_alone_as_in_a_batch(scene: Scene) -> None:
         assert torch.equal(alone.masks[0], together.masks[n][together.valid[n]])
 
 
+def test_regions_of_two_scales(scene: Scene) -> None:
+    """All of the first, and of the second those that are not among them."""
+    images = torch.stack([scene.image, torch.zeros_like(scene.image)])
+    maps = DensePatches(scales=[2.0, 3.0], size=140, margin=1)(images, Colors())
+    proposer = RegionProposer(components=4, min_patches=8)
+    first, second, both = (
+        proposer(Pictures(images, K.expand(2, 3, 3), part)) for part in (maps[:1], maps[1:], maps)
+    )
+    for n in range(2):
+        a, b, joined = (found.masks[n][found.valid[n]] for found in (first, second, both))
+        assert torch.equal(joined[: len(a)], a)
+        known = {mask.numpy().tobytes() for mask in b}
+        assert all(mask.numpy().tobytes() in known for mask in joined[len(a) :])
+        for mask in joined[len(a) :]:
+            assert max(overlap(mask, other) for other in a) < 0.8
+    assert int(both.valid[0].sum()) > int(first.valid[0].sum())
+
+
 def test_a_picture_without_regions() -> None:
     image = torch.zeros(1, 3, 60, 60)
-    dense = DensePatches(scale=1.0, size=140, margin=1)
+    dense = DensePatches(scales=[1.0], size=140, margin=1)
     proposals = RegionProposer(min_patches=200)(Pictures(image, K[None], dense(image, Colors())))
     assert proposals.masks.shape == (1, 0, 60, 60)
 

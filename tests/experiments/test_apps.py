@@ -335,7 +335,7 @@ def test_objects_are_found_in_a_folder_and_a_video(own_picture, monkeypatch, tmp
     pictures.mkdir()
     shutil.copy(image.removeprefix("image="), pictures / "a.png")
     Image.new("RGB", (640, 480), (90, 90, 90)).save(pictures / "b.png")
-    few = ["detector.candidates=8", "detector.max_detections=2", "detector.dense.scale=1"]
+    few = ["detector.candidates=8", "detector.max_detections=2", "detector.dense.scales=[1]"]
     arguments = [*arguments, *few, f"meshes=[{folder / 'cup.ply'}]"]
     run = [*arguments, f"image={pictures}", f"hydra.run.dir={tmp_path / 'run'}"]
     run_app(monkeypatch, "estimate", *run)
