@@ -20,8 +20,8 @@ class FoundInstances(NamedTuple):
     Attributes:
         detections: where they are, and what the detector says of them.
         estimates: their poses.
-        score: (D,) the detector's score times the pose's probability, or its score where the pipeline has no confidence,
-            in [0, 1].
+        score: (D,) in [0, 1], the detector's score times the pose's probability, or times the pose's score where the
+            pipeline has no confidence.
     """
 
     detections: Detections
