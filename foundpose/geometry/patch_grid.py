@@ -1,13 +1,15 @@
 """Where the patches of a picture lie."""
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from foundpose.geometry.cameras import pixel_grid
+
+PixelsT = TypeVar("PixelsT", float, Tensor)
 
 
 class PatchGrid(NamedTuple):
@@ -32,9 +34,14 @@ class PatchGrid(NamedTuple):
         """Pixel coordinates (size, size, 2) of the patch centres as ``(u, v)``."""
         return pixel_grid(self.size, self.size, device, dtype) * self.stride + self.offset
 
-    def to_map(self, pixels: Tensor) -> Tensor:
+    def to_map(self, pixels: PixelsT) -> PixelsT:
         """Pixels in the grid's own coordinates, in which patch (row, column) lies at ``(column, row)``."""
         return (pixels - self.offset) / self.stride
+
+    def map_intrinsics(self, K: Tensor) -> Tensor:
+        """Intrinsics (..., 3, 3) that project into the grid's own coordinates, from those that do into pixels."""
+        shift = K[..., 2:, :] * self.offset
+        return torch.cat([(K[..., :2, :] - shift) / self.stride, K[..., 2:, :]], dim=-2)
 
     def pixels_of(self, cells: Tensor, dtype: torch.dtype) -> Tensor:
         """Pixel coordinates (..., 2) of the centres of patches (...), counted row by row."""

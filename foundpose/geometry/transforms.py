@@ -7,12 +7,8 @@
 import math
 
 import torch
-import torch.nn.functional as F
 from kornia.geometry.linalg import inverse_transformation
 from torch import Tensor
-
-# Below this squared angle the coefficients of the exponential map are summed as power series.
-_SMALL_SQUARED_ANGLE = 0.25
 
 
 def make_transform(R: Tensor, t: Tensor) -> Tensor:
@@ -60,37 +56,25 @@ def se3_exp(twist: Tensor) -> Tensor:
     """
     if twist.shape[-1] != 6:
         raise ValueError(f"twist must have shape (..., 6), got {tuple(twist.shape)}")
-    # Written out, where kornia's So3 takes six times as many operations: optimisers call this in every step.
-    v, w = twist.unsqueeze(-1).split(3, dim=-2)
-    identity = torch.eye(4, dtype=twist.dtype, device=twist.device)
-    # The series of exp(X) ends: X⁴ = −θ² X² for a twist's matrix X, so I + X + B X² + C X³ is all of it. The product
+    # Written out, where kornia's So3 takes six times as many operations: optimisers call this in every step. The
+    # series of exp(X) ends: X⁴ = −θ² X² for a twist's matrix X, so I + X + B X² + C X³ is all of it. The product
     # of ω's skew-symmetric matrix with another is the cross product with its columns.
-    columns = identity[:3].expand(*twist.shape[:-1], 3, 4)
-    X = torch.linalg.cross(w, columns, dim=-2) + F.pad(v, (3, 0))
-    square = torch.linalg.cross(w, X, dim=-2)
-    cube = torch.linalg.cross(w, square, dim=-2)
-    B, C = _exponential_coefficients(w.square().sum(-2, keepdim=True))
-    return identity + F.pad(X + B * square + C * cube, (0, 0, 0, 1))
-
-
-def _exponential_coefficients(squared: Tensor) -> tuple[Tensor, Tensor]:
-    """(1 − cos θ) / θ² and (θ − sin θ) / θ³ of squared angles θ², smooth through zero."""
-    small = squared < _SMALL_SQUARED_ANGLE
-    near = torch.where(small, squared, 0.0)
-    far = torch.where(small, 1.0, squared)
-    angle = far.sqrt()
-    B = torch.where(small, _alternating_series(near, 2), (1.0 - angle.cos()) / far)
-    C = torch.where(small, _alternating_series(near, 3), (angle - angle.sin()) / (far * angle))
-    return B, C
-
-
-def _alternating_series(s: Tensor, first: int) -> Tensor:
-    """Σ (−s)ᵏ / (2k + first)! to rounding for s below the limit above."""
-    last = 5 if s.dtype == torch.float64 else 3
-    total = 1.0 / math.factorial(2 * last - 2 + first) - s * (1.0 / math.factorial(2 * last + first))
-    for k in range(last - 2, -1, -1):
-        total = 1.0 / math.factorial(2 * k + first) - s * total
-    return total
+    v, w = twist.unsqueeze(-1).split(3, dim=-2)
+    identity = torch.eye(4, dtype=twist.dtype, device=twist.device).expand(*twist.shape[:-1], 4, 4)
+    top, bottom = identity.split([3, 1], dim=-2)
+    first = torch.linalg.cross(w, top, dim=-2)
+    first[..., 3:] += v
+    second = torch.linalg.cross(w, first, dim=-2)
+    third = torch.linalg.cross(w, second, dim=-2)
+    # What B and C change below an angle of ∛(24 ε) is less than rounding; there they count as constants, which keeps
+    # their derivatives finite.
+    least = (24.0 * torch.finfo(twist.dtype).eps) ** (2.0 / 3.0)
+    squared = w.square().sum(-2, keepdim=True).clamp(min=least)
+    angle = squared.sqrt()
+    B = 0.5 * torch.sinc(angle / (2.0 * math.pi)).square()  # (1 − cos θ) / θ²
+    C = (1.0 - torch.sinc(angle / math.pi)) / squared  # (θ − sin θ) / θ³
+    moved = torch.addcmul(torch.addcmul(top + first, B, second), C, third)
+    return torch.cat([moved, bottom], dim=-2)
 
 
 def rotation_angle(R_a: Tensor, R_b: Tensor) -> Tensor:

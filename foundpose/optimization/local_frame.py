@@ -7,6 +7,9 @@ from torch import Tensor
 
 from foundpose.geometry.transforms import make_transform, transform_points
 
+# Smallest depth that is divided by, in units of the object's size: no camera sees anything from so close.
+_NEAREST = 1e-3
+
 
 class LocalFrame(NamedTuple):
     """The frame that a pose is optimised in: ``x_camera = origin + size * (T_local @ x_local)``.
@@ -46,36 +49,42 @@ class LocalFrame(NamedTuple):
         t = self.origin + self.size * T_local[:, :3, 3] - (R @ self.centroid.unsqueeze(-1)).squeeze(-1)
         return make_transform(R, t)
 
-    def points(self, points_model: Tensor) -> Tensor:
-        """Model points (B, N, 3) in units of this frame."""
-        return (points_model - self.centroid.unsqueeze(-2)) / self.size.unsqueeze(-1)
 
-    def project(self, T_local: Tensor, points_local: Tensor, K: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Project points of this frame, with derivatives.
+class LocalProjection:
+    """Projects points from a local frame into an image, with derivatives.
 
-        Points come last in what is returned: operations on many points for a few coordinates are fast that way.
+    Args:
+        frame: where the local frames lie.
+        points_model: (B, N, 3) mesh units.
+        K: (B, 3, 3) intrinsics.
+    """
+
+    def __init__(self, frame: LocalFrame, points_model: Tensor, K: Tensor) -> None:
+        # Whatever does not change with the pose is computed here. Points come last: operations on many points for a
+        # few coordinates are fast that way.
+        points = (points_model - frame.centroid.unsqueeze(-2)) / frame.size.unsqueeze(-1)
+        self.points = points.transpose(1, 2).contiguous()
+        self.origin = (frame.origin / frame.size).unsqueeze(-1)
+        self.focal, self.centre = K[:, :2].split([2, 1], dim=-1)
+        self.slopes = self.focal.transpose(1, 2).unsqueeze(-1).expand(-1, -1, -1, points.shape[1])
+
+    def __call__(self, T_local: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Project.
 
         Args:
             T_local: (B, 4, 4).
-            points_local: (B, N, 3).
-            K: (B, 3, 3) intrinsics.
 
         Returns:
-            Pixels (B, 2, N), depths (B, N) in mesh units, and the derivatives (B, 6, 2, N) of the pixels in δ for
-            ``T_local ← exp(δ) @ T_local``. Where the depth is not positive, pixels and derivatives are finite but
-            mean nothing. Differentiable w.r.t. all tensors.
+            Pixels (B, 2, N), depths (B, N) in units of the object's size, and the derivatives (B, 6, 2, N) of the
+            pixels in δ for ``T_local ← exp(δ) @ T_local``. Where the depth is not positive, pixels and derivatives
+            are finite but mean nothing. Differentiable w.r.t. all tensors.
         """
-        size = self.size.unsqueeze(-1)
-        rotated = torch.baddbmm(T_local[:, :3, 3:], T_local[:, :3, :3], points_local.transpose(1, 2))
-        points_camera = self.origin.unsqueeze(-1) + size * rotated
-        depth = points_camera[:, 2:]
-        inverse = torch.where(depth > 0, depth, 1.0).reciprocal()
-        centre, focal = K[:, :2, 2:], K[:, :2, :2]
-        from_centre = torch.bmm(focal, points_camera[:, :2] * inverse)
-        # d pixels / d points_camera times size, then d points_camera / d δ = size [I, −[rotated]×].
-        scaled = inverse * size
-        by_plane = focal.transpose(1, 2).unsqueeze(-1) * scaled.unsqueeze(1)
-        by_depth = from_centre * -scaled
-        by_point = torch.cat([by_plane, by_depth.unsqueeze(1)], dim=1)  # (B, 3, 2, N)
-        by_rotation = torch.linalg.cross(rotated.unsqueeze(2).expand_as(by_point), by_point, dim=1)
-        return from_centre + centre, depth.squeeze(1), torch.cat([by_point, by_rotation], dim=1)
+        R, t = T_local[:, :3].split([3, 1], dim=-1)
+        rotated = torch.baddbmm(t, R, self.points)
+        plane, depth = (rotated + self.origin).split([2, 1], dim=1)
+        inverse = depth.clamp(min=_NEAREST).reciprocal()
+        from_centre = torch.bmm(self.focal, plane * inverse)
+        # d pixels / d points in units of the size, then d points / d δ = [I, −[rotated]×].
+        by_point = torch.cat([self.slopes, -from_centre.unsqueeze(1)], dim=1) * inverse.unsqueeze(1)
+        by_rotation = torch.linalg.cross(rotated.unsqueeze(2), by_point, dim=1)
+        return from_centre + self.centre, depth.squeeze(1), torch.cat([by_point, by_rotation], dim=1)

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from foundpose.optimization import NormalEquations, RobustLoss
-from foundpose.optimization.local_frame import LocalFrame
+from foundpose.optimization.local_frame import LocalFrame, LocalProjection
 from foundpose.pnp.problem import PnpProblem
 
 
@@ -24,19 +24,19 @@ def reprojection_cost(
         A function of ``T_local`` (B, 4, 4) that gives the :class:`NormalEquations` of ``T_local ← exp(δ) @ T_local``;
         the cost is infinite where a weighted point lies behind the camera. Differentiable w.r.t. all tensors.
     """
-    points_local, target = frame.points(problem.points_model), problem.points_image.transpose(1, 2)
+    project = LocalProjection(frame, problem.points_model, problem.K)
+    target = problem.points_image.transpose(1, 2).contiguous()
     weights, used = problem.weights, problem.weights > 0
+    unused = ~used
 
     def evaluate(T_local: Tensor) -> NormalEquations:
-        pixels, depth, J = frame.project(T_local, points_local, problem.K)
-        in_front = depth > 0
+        pixels, depth, J = project(T_local)
         residual = pixels - target
         rho, slope = loss(residual.square().sum(1))
         # Points out of use may lie anywhere, also where their residual overflows.
-        cost = 0.5 * torch.where(used, weights * rho, 0.0).sum(-1)
-        counts = used & in_front
-        cost = cost.masked_fill((used ^ counts).any(-1), torch.inf)
-        share = torch.where(counts, weights * slope, 0.0)
+        cost = 0.5 * (weights * rho.masked_fill(unused, 0.0)).sum(-1)
+        cost = cost.masked_fill((used & (depth <= 0)).any(-1), torch.inf)
+        share = weights * slope
         J = J.flatten(2)
         weighted = J * torch.cat([share, share], dim=-1).unsqueeze(1)
         H = torch.bmm(weighted, J.transpose(1, 2))

@@ -7,8 +7,8 @@ from torch import Tensor
 
 from foundpose.geometry import PatchGrid
 from foundpose.optimization import BarronLoss, Huber, NormalEquations, RobustLoss
-from foundpose.optimization.local_frame import LocalFrame
-from foundpose.refinement.interpolation import Interpolation, sample_features
+from foundpose.optimization.local_frame import LocalFrame, LocalProjection
+from foundpose.refinement.interpolation import FeatureSampler, Interpolation
 
 ResidualKind = Literal["channel", "norm"]
 AutoScale = bool | Literal["object"]
@@ -108,8 +108,11 @@ class FeaturemetricCost:
         self.frame = frame
         self.loss = loss
         self.residual = residual
-        self.interpolation = interpolation
-        self.points_local = frame.points(problem.points_model)
+        maps = problem.maps
+        self.project = LocalProjection(frame, problem.points_model, maps.grid.map_intrinsics(problem.K))
+        self.sample = FeatureSampler(maps.values, problem.map_index, interpolation)
+        # Where the crop begins and ends in the map's coordinates.
+        self._edges = maps.grid.to_map(-0.5), maps.grid.to_map(maps.image_size - 0.5)
         self.count = problem.valid.sum(-1).clamp(min=1)
         self._unit = self._measured_unit(T_local, auto_scale) if auto_scale else None
         descriptors = problem.descriptors.detach()
@@ -118,45 +121,40 @@ class FeaturemetricCost:
         )
         # What a patch costs while it is not seen.
         self._lost = self.ceiling.masked_fill(~problem.valid, 0.0)
-        self._per_patch = self.count.to(self._lost.dtype).reciprocal()
+        self._per_patch = self.count.to(self._lost.dtype).reciprocal().unsqueeze(-1)
 
     def __call__(self, T_local: Tensor) -> Linearisation:
         """Linearise the cost at poses (n, 4, 4) for ``T_local ← exp(δ) @ T_local``; differentiable."""
         rows, seen, J = self._residual_rows(T_local)
         if self._unit is not None:
-            rows = rows * self._unit[:, None, None, None]
-        squared = rows[:, :, 0].square()
+            rows = rows * self._unit[:, None, None]
+        squared = rows[0].square()
         if self.residual == "norm":
             squared = squared.sum(-1, keepdim=True)
         rho, weight = self.loss(squared)
-        cost = torch.where(seen, rho.sum(-1), self._lost).sum(-1) * self._per_patch
+        share = seen * self._per_patch
+        cost = (torch.where(seen, rho.sum(-1), self._lost) * self._per_patch).sum(-1)
         # All channels of a patch come down to the products of its slopes with its three rows.
-        slopes = (rows[:, :, 1:] * weight.unsqueeze(2)).flatten(0, 1)
-        share = seen * self._per_patch.unsqueeze(-1)
-        products = torch.bmm(slopes, rows.flatten(0, 1).transpose(1, 2)) * share.reshape(-1, 1, 1)
-        products = products.unflatten(0, seen.shape).permute(0, 2, 3, 1)  # (n, 2, 3, P)
-        weighted = (J.unsqueeze(2) * products[:, None, :, 1:]).sum(3).flatten(2)
-        J = J.flatten(2)
-        H = torch.bmm(weighted, J.transpose(1, 2))
-        g = torch.bmm(J, products[:, :, 0].flatten(1).unsqueeze(-1)).squeeze(-1)
+        slopes, rows = (rows[1:] * weight).flatten(1, 2), rows.flatten(1, 2)
+        products = torch.bmm(slopes.transpose(0, 1), rows.permute(1, 2, 0)).unflatten(0, seen.shape)
+        products = products.permute(0, 2, 3, 1) * share[:, None, None]  # (n, 2, 3, P)
+        weighted = (J.unsqueeze(3) * products.unsqueeze(1)).sum(2)  # (n, 6, 3, P)
+        H = torch.bmm(weighted[:, :, 1:].flatten(2), J.flatten(2).transpose(1, 2))
+        g = weighted[:, :, 0].sum(-1)
         return Linearisation(NormalEquations(0.5 * cost, H, g), squared, weight, share)
 
     def mean_ceiling(self) -> Tensor:
         """Mean ρ (n,) if no patch were seen."""
-        return self._lost.sum(-1) * self._per_patch
+        return (self._lost * self._per_patch).sum(-1)
 
     def _residual_rows(self, T_local: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Residuals of patches and their slopes along columns and rows of the map (n, P, 3, d), which patches are
+        """Residuals of patches and their slopes along columns and rows of the map (3, n, P, d), which patches are
         seen (n, P), and derivatives of the map's coordinates in the pose (n, 6, 2, P)."""
-        maps, problem = self.problem.maps, self.problem
-        pixels, depth, J = self.frame.project(T_local, self.points_local, problem.K)
-        inside = ((pixels >= -0.5) & (pixels <= maps.image_size - 0.5)).all(1)
-        seen = problem.valid & (depth > 0) & inside
-        pixels = torch.where(seen.unsqueeze(1), pixels, 0.0)
-        position = maps.grid.to_map(pixels).transpose(1, 2)
-        rows = sample_features(maps.values, problem.map_index, position, self.interpolation)
-        rows[:, :, 0].sub_(problem.descriptors)
-        J = torch.where(seen[:, None, None], J, 0.0) / maps.grid.stride
+        position, depth, J = self.project(T_local)
+        first, last = self._edges
+        seen = self.problem.valid & (depth > 0) & (position.clamp(first, last) == position).all(1)
+        rows = self.sample(position.transpose(1, 2).contiguous())
+        rows[0].sub_(self.problem.descriptors)
         return rows, seen, J
 
     @torch.no_grad()
@@ -168,7 +166,7 @@ class FeaturemetricCost:
             return self.problem.sizes.to(T_local.dtype).reciprocal()
         assert isinstance(self.loss, BarronLoss | Huber)
         rows, seen, _ = self._residual_rows(T_local)
-        size = rows[:, :, 0].abs()
+        size = rows[0].abs()
         if self.residual == "norm":
             size = torch.linalg.vector_norm(size, dim=-1, keepdim=True)
         size = size.masked_fill(~seen.unsqueeze(-1), torch.nan).flatten(1)
