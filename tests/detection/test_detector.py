@@ -14,8 +14,9 @@ from foundpose.detection import (
     RegionProposer,
     pad_proposals,
 )
-from foundpose.detection.scoring import TemplateMeans
+from foundpose.detection.scoring import ViewsOfTemplates
 from foundpose.geometry import PerspectiveCrop
+from foundpose.representation import ObjectRepresentation
 from tests.detection.conftest import SIDE, Colors, K, Scene
 
 
@@ -49,18 +50,36 @@ def distractors(scene: Scene) -> Tensor:
     return torch.cat([scene.masks, part[None], grey])
 
 
-def test_template_means(scene: Scene) -> None:
+def test_views_of_templates(scene: Scene) -> None:
     obj = scene.objects["red"]
-    means = TemplateMeans()(obj)
+    views = ViewsOfTemplates()(obj)
     for t in range(obj.num_templates):
         rows = torch.arange(int(obj.template_offsets[t]), int(obj.template_offsets[t + 1]))
         z = obj.read_descriptors(rows).mean(dim=0)
-        torch.testing.assert_close(means[t], z @ obj.projection.components + obj.projection.mean)
+        torch.testing.assert_close(views.means[t], z @ obj.projection.components + obj.projection.mean)
+        assert torch.equal(views.shapes[t].nonzero()[:, 0], obj.patch_index[rows].long())
+
+
+def shapes_overlap(inside: Tensor, obj: ObjectRepresentation) -> Tensor:
+    """Intersection over union (T,) of a region's cells (10, 10) and each template's, by sets."""
+    mine = set(inside.flatten().nonzero()[:, 0].tolist())
+    overlaps = []
+    for t in range(obj.num_templates):
+        cells = obj.patch_index[int(obj.template_offsets[t]) : int(obj.template_offsets[t + 1])]
+        theirs = set(cells.tolist())
+        overlaps.append(len(mine & theirs) / len(mine | theirs))
+    return torch.tensor(overlaps)
+
+
+def with_lead(similarity: Tensor) -> Tensor:
+    """Similarities (P, 3) of three objects, and half of each one's lead over the best of the others."""
+    lead = [similarity[:, o] - similarity[:, [p for p in range(3) if p != o]].amax(1) for o in range(3)]
+    return similarity + 0.5 * torch.stack(lead, dim=1)
 
 
 def test_crop_scores_as_written_out(scene: Scene) -> None:
     """The definition, for one region and object at a time."""
-    scorer, masks = crop_scorer(views=3, patches=0.25, rivals=0.5), distractors(scene)
+    scorer, masks = crop_scorer(views=3, patches=0.25, rivals=0.5, shape=0.3), distractors(scene)
     objects = list(scene.objects.values())
     proposals = pad_proposals([masks])
     wanted = torch.ones(1, len(masks), len(objects), dtype=torch.bool)
@@ -74,15 +93,45 @@ def test_crop_scores_as_written_out(scene: Scene) -> None:
         inside = F.avg_pool2d(cut.masks[None], 2, 1)[0, 0, 6::14, 6::14] > 0.5  # the patches' centres, at 6.5
         mean = said.patches[0][:, inside].mean(dim=1)
         for o, obj in enumerate(objects):
-            means = TemplateMeans()(obj)
-            of_patches = F.cosine_similarity(mean[None], means).sort(descending=True).values[:3].mean()
-            of_cls = F.cosine_similarity(said.cls, obj.template_cls).sort(descending=True).values[:3].mean()
-            expected[i, o] = 0.25 * of_patches + 0.75 * of_cls
-    lead = torch.stack(
-        [expected[:, o] - expected[:, [p for p in range(3) if p != o]].amax(1) for o in range(3)], 1
-    )
-    expected = torch.where(wanted[0], expected + 0.5 * lead, torch.zeros(()))
+            of_patches = F.cosine_similarity(mean[None], ViewsOfTemplates()(obj).means)
+            of_cls = F.cosine_similarity(said.cls, obj.template_cls)
+            of_views = (0.25 * of_patches + 0.75 * of_cls + 0.3 * shapes_overlap(inside, obj)) / 1.3
+            expected[i, o] = of_views.sort(descending=True).values[:3].mean()
+    expected = torch.where(wanted[0], with_lead(expected), torch.zeros(()))
     torch.testing.assert_close(score[0], expected, atol=1e-5, rtol=1e-5)
+
+
+def test_the_quick_choice_as_written_out(scene: Scene) -> None:
+    """With shapes of crops of half the templates' size."""
+    masks, objects = distractors(scene), list(scene.objects.values())
+    crop = PerspectiveCrop(size=SIDE // 2, antialias=False)
+    scorer = MeanDescriptorScorer(views=2, rivals=0.5, shape=0.4, crop=crop)
+    maps = DensePatches(scales=[2.0], size=SIDE, margin=1)(scene.image[None], Colors())
+    wanted = torch.ones(1, len(masks), len(objects), dtype=torch.bool)
+    pictures = Pictures(scene.image[None], K[None], maps)
+    score = scorer(pictures, pad_proposals([masks]), objects, Colors(), wanted)
+    expected = torch.zeros(len(masks), len(objects))
+    for i, mask in enumerate(masks):
+        share = maps[0].share_of(mask[None])[0]
+        mean = (maps[0].descriptors[0] * share).sum((1, 2)) / share.sum()
+        inside = crop(scene.image[None], K[None], mask[None]).masks[0, 3::7, 3::7] > 0.5
+        for o, obj in enumerate(objects):
+            of_patches = F.cosine_similarity(mean[None], ViewsOfTemplates()(obj).means)
+            of_views = (of_patches + 0.4 * shapes_overlap(inside, obj)) / 1.4
+            expected[i, o] = of_views.sort(descending=True).values[:2].mean()
+    torch.testing.assert_close(score[0], with_lead(expected), atol=1e-4, rtol=1e-4)
+
+
+def test_a_piece_of_an_object_has_not_its_shape(scene: Scene) -> None:
+    masks = torch.stack([scene.masks[0], distractors(scene)[3]])
+    leads = []
+    for shape in (0.0, 0.5):
+        scorer = crop_scorer(shape=shape, rivals=0.0)
+        wanted = torch.ones(1, 2, 1, dtype=torch.bool)
+        pictures = Pictures(scene.image[None], K[None])
+        score = scorer(pictures, pad_proposals([masks]), [scene.objects["red"]], Colors(), wanted)[0, :, 0]
+        leads.append(float(score[0] - score[1]))
+    assert leads[1] > leads[0] + 0.02
 
 
 def test_finds_every_instance_and_not_what_is_absent(scene: Scene) -> None:
@@ -202,3 +251,5 @@ def test_refusals(scene: Scene) -> None:
         detector(scene.masks, overlap=2.0)
     with pytest.raises(ValueError, match="views must be at least 1"):
         crop_scorer(views=0)
+    with pytest.raises(ValueError, match="shape must be at least 0, got -1"):
+        MeanDescriptorScorer(shape=-1.0)

@@ -195,7 +195,7 @@ def test_an_improbable_pose_is_not_found(own_picture, monkeypatch, tmp_path, cap
     with pytest.raises(SystemExit) as stop:
         run_app(monkeypatch, "estimate", *arguments, f"hydra.run.dir={tmp_path / 'held'}")
     assert stop.value.code == 1
-    message = "not found: UNLIKELY, the pose is right with a probability of 0.05 only (min_confidence=0.5)"
+    message = "not found: UNLIKELY, the pose is right with a probability of 0.05 only (min_confidence=0.3)"
     assert message in capsys.readouterr().err
     facts = json.loads((tmp_path / "held" / "estimate.json").read_text())
     assert (facts["valid"], facts["status"]) == (False, "UNLIKELY")
