@@ -8,10 +8,9 @@ import torch
 from torch import Tensor
 
 from foundpose.geometry.cameras import pixel_rays
-from foundpose.geometry.transforms import transform_points
 from foundpose.pnp.dlt import solve_dlt_minimal
 from foundpose.pnp.epnp import solve_epnp_minimal
-from foundpose.pnp.p3p import solve_p3p_rays
+from foundpose.pnp.p3p import solve_p3p_minimal
 from foundpose.pnp.problem import MinimalSolution, PnpProblem
 from foundpose.pnp.scoring import score_poses
 
@@ -19,29 +18,6 @@ from foundpose.pnp.scoring import score_poses
 _LEAST_SAMPLES = 50
 
 SolverName = Literal["epnp", "p3p", "dlt"]
-
-
-def solve_p3p_minimal(rays: Tensor, points_model: Tensor) -> MinimalSolution:
-    """P3P on the first three of four correspondences; the fourth chooses among the roots.
-
-    Args:
-        rays: (S, 4, 3) rays in the camera frame with z = 1, finite.
-        points_model: (S, 4, 3) mesh units, finite.
-
-    Returns:
-        A :class:`MinimalSolution`.
-    """
-    roots = solve_p3p_rays(rays[:, :3], points_model[:, :3])
-    T = roots.T_camera_from_model
-    fourth = transform_points(T, points_model[:, None, 3:]).squeeze(-2)  # (S, 4, 3)
-    ahead = roots.valid & (fourth[..., 2] > 0)
-    plane = fourth[..., :2] / torch.where(ahead, fourth[..., 2], torch.ones_like(fourth[..., 2])).unsqueeze(
-        -1
-    )
-    error = (plane - rays[:, None, 3, :2]).square().sum(-1).masked_fill(~ahead, torch.inf)
-    best = error.argmin(dim=1, keepdim=True)
-    T = torch.take_along_dim(T, best[..., None, None], dim=1).squeeze(1)
-    return MinimalSolution(T, ahead.any(1), roots.degenerate)
 
 
 # Correspondences of a sample, and its solver: rays (S, n, 3) and model points (S, n, 3) to poses.

@@ -10,8 +10,9 @@ from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from foundpose.geometry.transforms import transform_points
 from foundpose.pnp import PnpProblem
-from foundpose.pnp.p3p import P3PSolutions, solve_p3p, solve_p3p_rays
+from foundpose.pnp.p3p import P3PSolutions, solve_p3p, solve_p3p_minimal, solve_p3p_rays
 from tests.pnp.scenes import Scene, make_scene, stack
 
 SHAPES = ["volume", "ellipsoid", "plane"]
@@ -338,3 +339,20 @@ def test_bad_input() -> None:
         solve_p3p(PnpProblem(image, model, K[0]))
     with pytest.raises(ValueError, match="float64"):
         solve_p3p(PnpProblem(image, model.double(), K))
+
+
+def test_the_fourth_correspondence_chooses_the_root() -> None:
+    generator = torch.Generator().manual_seed(4)
+    model = torch.randn(500, 4, 3, generator=generator, dtype=torch.float64)
+    rays = torch.rand(500, 4, 3, generator=generator, dtype=torch.float64) - 0.5
+    rays[..., 2] = 1.0
+    every = solve_p3p_rays(rays[:, :3], model[:, :3])
+    fourth = transform_points(every.T_camera_from_model, model[:, None, 3:]).squeeze(-2)
+    ahead = every.valid & (fourth[..., 2] > 0)
+    error = torch.linalg.vector_norm(fourth[..., :2] / fourth[..., 2:] - rays[:, 3:, :2], dim=-1)
+    best = error.masked_fill(~ahead, torch.inf).argmin(1)
+    one = solve_p3p_minimal(rays, model)
+    assert torch.equal(one.valid, ahead.any(1))
+    assert 100 < one.valid.sum() < 500
+    expected = every.T_camera_from_model[torch.arange(500), best]
+    torch.testing.assert_close(one.T_camera_from_model[one.valid], expected[one.valid])
