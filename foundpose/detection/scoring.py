@@ -180,7 +180,7 @@ class CropScorer(ProposalScorer):
         views: int = 5,
         patches: float = 0.5,
         rivals: float = 0.5,
-        shape: float = 0.5,
+        shape: float = 0.25,
         batch_size: int = 16,
     ) -> None:
         super().__init__()
