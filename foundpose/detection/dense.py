@@ -55,8 +55,8 @@ class DensePatches(nn.Module):
         self, scales: Sequence[float] = (2.0,), size: int = 420, margin: int = 3, batch_size: int = 8
     ) -> None:
         super().__init__()
-        if not scales or not all(scale > 0 for scale in scales):
-            raise ValueError(f"scales must be positive, and at least one, got {list(scales)}")
+        if not isinstance(scales, Sequence) or not scales or not all(scale > 0 for scale in scales):
+            raise ValueError(f"scales must be a list of positive numbers, such as [2.0], got {scales}")
         if margin < 0:
             raise ValueError(f"margin must be at least 0 patches, got {margin}")
         if batch_size < 1:

@@ -78,8 +78,11 @@ def test_gradients_reach_the_picture() -> None:
 
 
 def test_refusals() -> None:
-    with pytest.raises(ValueError, match=r"scales must be positive, and at least one, got \[0.0\]"):
-        DensePatches(scales=[0.0])
+    for scales in ([0.0], [], 2.0):
+        with pytest.raises(
+            ValueError, match=r"scales must be a list of positive numbers, such as \[2.0\], got"
+        ):
+            DensePatches(scales=scales)
     with pytest.raises(ValueError, match="margin"):
         DensePatches(margin=-1)
     with pytest.raises(ValueError, match="must leave some"):
