@@ -1,4 +1,6 @@
 import inspect
+from copy import deepcopy
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 
@@ -37,6 +39,7 @@ MODULES = {
     "robust_loss",
     "refiner",
 }
+TOGETHER = sorted({*MODULES, "data", "masks"} - {"hypotheses"})  # none of these changes what another one says
 INLINE = ["crop", "projection", "words", "start"]  # of config.yaml
 # What makes extractors small; their weights are not here.
 SIZES = "hidden_size: 24, num_attention_heads: 2, num_hidden_layers: 1"
@@ -59,14 +62,26 @@ SMALL_SAM = [
 SMALL_MEGAPOSE = ["megapose.weights=random", "megapose.seed=0", "megapose.width=4"]
 
 
-def load(name="config", *overrides):
+@cache
+def composed(name, overrides, with_hydra):
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose(name, overrides=list(overrides))
+        return compose(name, overrides=list(overrides), return_hydra_config=with_hydra)
+
+
+def load(name="config", *overrides):
+    return deepcopy(composed(name, overrides, False))
 
 
 def load_with_hydra(name, *overrides):
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose(name, overrides=list(overrides), return_hydra_config=True)
+    return deepcopy(composed(name, overrides, True))
+
+
+def load_with(group, option):
+    """The settings with an option of a method's group; each composition has one of every such group."""
+    columns = {g: [o for h, o in GROUPS if h == g] for g in TOGETHER}
+    k = columns[group].index(option)
+    overrides = [f"{g}={options[min(k, len(options) - 1)]}" for g, options in columns.items()]
+    return load("config", *overrides, *SMALL_MEGAPOSE)
 
 
 @pytest.mark.parametrize(("group", "option"), GROUPS)
@@ -113,7 +128,7 @@ def test_every_option_is_instantiated_and_has_the_keys_and_defaults_of_its_const
     if group == "extractor" and option.startswith(tuple(SMALL)):
         overrides += SMALL[next(name for name in SMALL if option.startswith(name))]
         overrides += ["extractor.weights=random", "extractor.seed=0"]
-    cfg = load("config", *overrides, *SMALL_MEGAPOSE)
+    cfg = load_with(group, option) if group in TOGETHER else load("config", *overrides, *SMALL_MEGAPOSE)
     if group == "data":
         cfg.data.root, cfg.data.split, cfg.data.models = str(tiny_bop), "test", "models"
     if group in {*MODULES, "extractor", "proposer"}:
@@ -132,10 +147,10 @@ def test_every_option_is_instantiated_and_has_the_keys_and_defaults_of_its_const
         assert isinstance(instantiate(cfg.data), BopDataset)
     elif group == "proposer":
         if option == "file":
-            path = tiny_bop / "detections" / "cnos-fastsam" / "detections.json"
-            cfg = load("config", "proposer=file", f"proposer.path={path}")
-        small = [*overrides, *SMALL_SAM] if option == "sam" else []
-        assert isinstance(instantiate((load("config", *small) if small else cfg).proposer), Proposer)
+            cfg.proposer.path = str(tiny_bop / "detections" / "cnos-fastsam" / "detections.json")
+        elif option == "sam":
+            cfg = load("config", *overrides, *SMALL_SAM)
+        assert isinstance(instantiate(cfg.proposer), Proposer)
     elif group == "masks" and option == "detect":
         assert cfg.masks.path is None  # found first
     elif group == "masks":
@@ -168,9 +183,18 @@ def test_queries_are_corrupted_and_templates_are_not():
     assert instantiate(corruption)(DenseSift()).fingerprint() == DenseSift().fingerprint()
 
 
-@pytest.mark.parametrize("app", sorted({path.stem for path in CONF.glob("*.yaml")} - {"config"}))
+APPS = sorted({path.stem for path in CONF.glob("*.yaml")} - {"config"})
+WITHOUT_METHOD = {"check", "view", "gpu_check"}
+
+
+def load_app(name):
+    overrides = ["extractor=dense_sift", "words.num_words=32", "descriptors.sigma=0.7"]
+    return load_with_hydra(name, f"hydra.job.name={name}", *([] if name in WITHOUT_METHOD else overrides))
+
+
+@pytest.mark.parametrize("app", APPS)
 def test_a_run_has_a_folder_of_its_app(app):
-    cfg = load_with_hydra(app, f"hydra.job.name={app}")
+    cfg = load_app(app)
     assert Path(cfg.hydra.run.dir).parts[:2] == ("outputs", app)
     assert not cfg.hydra.job.chdir
 
@@ -191,18 +215,10 @@ def test_the_default_is_the_papers_but_for_what_was_measured():
     assert cfg.retrieval.retriever.bow == cfg.onboarder.bow
 
 
-# check.yaml, view.yaml and gpu_check.yaml have no method.
-@pytest.mark.parametrize(
-    "name", sorted({path.stem for path in CONF.glob("*.yaml")} - {"check", "view", "gpu_check"})
-)
+@pytest.mark.parametrize("name", sorted({*APPS} - WITHOUT_METHOD))
 def test_every_app_builds_its_method(name, tmp_path):
-    cfg = load(
-        name,
-        "extractor=dense_sift",
-        "words.num_words=32",
-        f"representations={tmp_path}",
-        "descriptors.sigma=0.7",
-    )
+    cfg = load_app(name)
+    cfg.representations = str(tmp_path)
     method = build_method(cfg)
     assert method.onboarder.bow.sigma == method.pipeline.retriever.retriever.bow.sigma == 0.7
     assert method.onboarder.extractor is method.pipeline.extractor

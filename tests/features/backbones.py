@@ -1,5 +1,7 @@
 """Small, randomly initialised backbones for tests."""
 
+from copy import deepcopy
+from functools import cache
 from typing import Any
 
 import torch
@@ -13,8 +15,17 @@ CLIP = {**SIZES, "intermediate_size": 64}
 SAM = {**SIZES, "mlp_dim": 64, "image_size": 128, "window_size": 3, "global_attn_indexes": [1, 3]}
 
 
-def make(name: str, seed: int | None = 0, weights: Any = "random", **kwargs: Any) -> PretrainedExtractor:
-    """A small extractor by the name of the backbone."""
+def make(name: str, *args: Any, **kwargs: Any) -> PretrainedExtractor:
+    """A small extractor by the name of the backbone, of its own; with seed 0 if there are no other settings."""
+    return _build(name, *args, **kwargs) if args or kwargs else deepcopy(_usual(name))
+
+
+@cache
+def _usual(name: str) -> PretrainedExtractor:
+    return _build(name)
+
+
+def _build(name: str, seed: int | None = 0, weights: Any = "random", **kwargs: Any) -> PretrainedExtractor:
     settings: dict[str, Any] = {"seed": seed, "weights": weights}
     match name:
         case "dinov3":

@@ -10,8 +10,8 @@ from tests.features.backbones import ALL, CLIP, DINOV3, SAM, TRANSFORMERS, make,
 CHANNELS = {"loftr": 256, "loftr_fine": 128, "s2dnet": 128, "s2dnet_all": 384}
 # Patches along the side of a picture: few for the large networks, and fewer in bfloat16, in which convolutions take
 # minutes on some processors.
-SIDES = {"loftr": 2, "loftr_fine": 2, "s2dnet": 2, "s2dnet_all": 2}
-SIDES_BF16 = SIDES | {"s2dnet_all": 1}
+SIDES = dict.fromkeys(CHANNELS, 2)
+SIDES_BF16 = dict.fromkeys(CHANNELS, 1)
 
 
 @pytest.fixture
