@@ -215,7 +215,7 @@ def test_the_default_is_the_papers_but_for_what_was_measured():
     assert cfg.retrieval.retriever.bow == cfg.onboarder.bow
 
 
-@pytest.mark.parametrize("name", sorted({*APPS} - WITHOUT_METHOD))
+@pytest.mark.parametrize("name", sorted({"config", *APPS} - WITHOUT_METHOD))
 def test_every_app_builds_its_method(name, tmp_path):
     cfg = load_app(name)
     cfg.representations = str(tmp_path)

@@ -58,7 +58,7 @@ def test_loftr_from_the_hub_is_kornias_download(monkeypatch) -> None:
         return original(None)
 
     monkeypatch.setattr(kornia.feature, "LoFTR", loftr)
-    make("loftr")
+    make("loftr", seed=0)
     assert asked == [None]
     LoftrBackbone("indoor_new")
     assert asked == [None, "indoor_new"]
