@@ -392,7 +392,7 @@ def best_of(repeats, *functions):
 def test_five_times_faster_than_the_loop_on_a_submission(lmo_root):
     models, work = lmo_workload(lmo_root)
     loop, ours = best_of(
-        5,
+        3,
         lambda: [by_numpy(models[obj_id], *poses) for obj_id, (*poses, _) in work.items()],
         lambda: [models[obj_id](*poses) for obj_id, (*poses, _) in work.items()],
     )

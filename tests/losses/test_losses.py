@@ -138,7 +138,8 @@ def test_errors_are_the_least_over_a_dense_set_of_symmetries(degrees):
     index = torch.arange(batch).repeat_interleave(S.shape[1])
     every = all_losses(T_est[index], T_true[index] @ S.flatten(0, 1), points[index], K[index])
     best = {
-        name: error.view_as(exists).masked_fill(~exists, torch.inf).amin(dim=1) for name, error in every.items()
+        name: error.view_as(exists).masked_fill(~exists, torch.inf).amin(dim=1)
+        for name, error in every.items()
     }
     for name, error in all_losses(T_est, T_true, points, K, symmetries).items():
         # Never above any sampled symmetry, never below by more than the sampling costs.

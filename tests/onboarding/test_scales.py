@@ -33,7 +33,7 @@ def dense_blob(oracle_onboarder, blob) -> ObjectRepresentation:
     dense = Onboarder(
         oracle_onboarder.renderer,
         oracle_onboarder.extractor,
-        SuperFibonacci(400),
+        SuperFibonacci(200),
         VisualWords(64, 3),
         SoftAssignBow(),
         PcaProjection(D),

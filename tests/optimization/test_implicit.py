@@ -29,7 +29,7 @@ def optimum(points_b: Tensor, points_a: Tensor, differentiation: str = "implicit
 def test_gradcheck_at_large_residuals() -> None:
     # Residuals of half the object's size: the Gauss-Newton matrix would be far from the second derivative.
     points_b, points_a, _ = problems(1, seed=7, noise=0.5)
-    inputs = (points_b[:, :5].clone().requires_grad_(), points_a[:, :5].clone().requires_grad_())
+    inputs = (points_b[:, :4].clone().requires_grad_(), points_a[:, :4].clone().requires_grad_())
     assert torch.autograd.gradcheck(optimum, inputs, eps=1e-4, atol=1e-4, rtol=1e-3)
 
 
