@@ -31,25 +31,24 @@ def score_poses(T: Tensor, problem: PnpProblem, threshold: float) -> Tensor:
     rows = T.shape[1]
     if T.device.type == "cpu":
         rows = max(1, _CPU_NUMBERS_PER_BLOCK // max(1, counts.numel()))
-    parts = points, observed, problem.K, counts, threshold
-    return torch.cat([_score_block(block, *parts) for block in T.split(rows, dim=1)], dim=1)
+    parts = points, observed, counts, threshold
+    return torch.cat([_score_block(M, *parts) for M in _projections(T, problem.K).split(rows, dim=1)], dim=1)
 
 
 def _score_block(
-    T: Tensor,
+    projections: Tensor,
     points: Sequence[Tensor],
     observed: Sequence[Tensor],
-    K: Tensor,
     valid: Tensor,
     threshold: float,
 ) -> Tensor:
     """Qualities (B, S); coordinates of points and pixels, and the mask as numbers, are (B, 1, N) each."""
-    buffer = torch.empty(*T.shape[:2], valid.shape[-1], dtype=T.dtype, device=T.device)
-    depth, u, v = (_affine(row, points, buffer) for row in _projection_rows(T, K))
+    buffer = projections.new_empty(*projections.shape[:2], valid.shape[-1])
+    u, v, depth = (_affine(row, points) for row in projections.unbind(2))
     for line, coordinate in zip((u, v), observed, strict=True):
-        line.sub_(torch.mul(depth, coordinate, out=buffer))
+        line.addcmul_(depth, coordinate, value=-1.0)
     ahead = torch.gt(depth, 0.0, out=buffer)
-    squared = u.square_().addcmul_(v, v).div_(depth.square_().clamp_(min=torch.finfo(T.dtype).tiny))
+    squared = u.square_().addcmul_(v, v).div_(depth.square_().clamp_(min=torch.finfo(buffer.dtype).tiny))
     inliers = torch.le(squared, threshold**2, out=v).mul_(ahead).mul_(valid)
     count = inliers.sum(-1)
     mean = squared.clamp_(max=threshold**2).mul_(inliers).sum(-1) / count.clamp(min=1)
@@ -57,18 +56,13 @@ def _score_block(
     return count + 0.5 * (1.0 - (mean / threshold**2).nan_to_num(nan=1.0))
 
 
-def _projection_rows(T: Tensor, K: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Rows (B, S, 4) of the projection that give depth, and pixel coordinates times depth."""
-    x, y, z = T[..., 0, :], T[..., 1, :], T[..., 2, :]
-    M = K[:, None, :, :, None]
-    u = M[:, :, 0, 0] * x + M[:, :, 0, 1] * y + M[:, :, 0, 2] * z
-    v = M[:, :, 1, 0] * x + M[:, :, 1, 1] * y + M[:, :, 1, 2] * z
-    return z, u, v
+def _projections(T: Tensor, K: Tensor) -> Tensor:
+    """Matrices (B, S, 3, 4) that give pixel coordinates times depth, and depth."""
+    x, y, z = (K[:, None, :, :, None] * T[:, :, None, :3]).unbind(3)
+    return x + y + z
 
 
-def _affine(row: Tensor, points: Sequence[Tensor], buffer: Tensor) -> Tensor:
+def _affine(row: Tensor, points: Sequence[Tensor]) -> Tensor:
     """``row`` (B, S, 4) times homogeneous points, coordinates (B, 1, N) each: (B, S, N)."""
-    total = row[..., 0:1] * points[0]
-    for i in (1, 2):
-        total.add_(torch.mul(row[..., i : i + 1], points[i], out=buffer))
-    return total.add_(row[..., 3:])
+    x, y, z, shift = row.split(1, dim=-1)
+    return (x * points[0]).addcmul_(y, points[1]).addcmul_(z, points[2]).add_(shift)
