@@ -20,8 +20,7 @@ class FoundInstances(NamedTuple):
     Attributes:
         detections: where they are, and what the detector says of them.
         estimates: their poses.
-        score: (D,) in [0, 1], the detector's score times the pose's probability, or times the pose's score where the
-            pipeline has no confidence.
+        score: (D,) the detector's score times the pose's, in [0, 1].
     """
 
     detections: Detections
@@ -106,7 +105,7 @@ class DetectAndEstimate(nn.Module):
             for rows in torch.arange(len(found.score)).split(self.batch_size):
                 estimates = estimate(rows)
                 valid.append(estimates.withhold(self.min_probability).valid)
-                score.append(_of_pose(estimates))
+                score.append(estimates.score)
                 T.append(estimates.T_camera_from_model)
         of_poses = torch.cat(score) * torch.cat(valid)
         kept = self._choose(found, torch.cat(T), found.score.detach() * of_poses, objects, most)
@@ -114,7 +113,7 @@ class DetectAndEstimate(nn.Module):
             return None
         estimates = estimate(kept)
         found = take_rows(found, kept)
-        return FoundInstances(found, estimates, found.score * _of_pose(estimates))
+        return FoundInstances(found, estimates, found.score * estimates.score)
 
     def _choose(
         self,
@@ -138,10 +137,6 @@ class DetectAndEstimate(nn.Module):
             if usable[i] and len(same) < most[label] and not near:
                 kept.append(i)
         return torch.tensor(kept, dtype=torch.int64)
-
-
-def _of_pose(estimates: PoseEstimates) -> Tensor:
-    return estimates.score if estimates.probability is None else estimates.probability
 
 
 def _counts(instances: int | Sequence[int] | None, objects: int, detections: int) -> list[int]:

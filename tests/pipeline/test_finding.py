@@ -106,22 +106,6 @@ def test_improbable_poses_are_no_instances(scene, oracle_blob) -> None:
     assert found(image[None], K[None], oracle_blob) is not None
 
 
-@torch.no_grad()
-def test_probability_decides_where_there_is_one(scene, oracle_blob) -> None:
-    """With numbers that call the blob right that is farther away, or nearer, it is the one that is found."""
-    image, masks, T = scene
-    found = finder(masks)
-    distance = {}
-    for weight in (-4.0, 4.0):
-        found.pipeline.confidence = PoseConfidence({"size": weight}, 0.0)
-        best = found(image[None], K[None], oracle_blob, instances=1)
-        assert best is not None
-        torch.testing.assert_close(best.score, best.detections.score * best.estimates.probability)
-        distance[weight] = float(best.estimates.T_camera_from_model[0, 2, 3])
-    assert distance[-4.0] == pytest.approx(float(T[1, 2, 3]), abs=20)
-    assert distance[4.0] == pytest.approx(float(T[0, 2, 3]), abs=20)
-
-
 def test_gradients_reach_the_picture(scene, oracle_blob) -> None:
     image, masks, _ = scene
     image = image.clone().requires_grad_()
