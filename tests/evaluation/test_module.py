@@ -54,6 +54,23 @@ def run(root, store, folder, masks=both_detections, memory_limit=None, **changes
     return data, objects, merge_shards(folder, data.batches)
 
 
+@pytest.fixture(scope="module")
+def detected(root, store, tmp_path_factory):
+    """Folder, data module and batches of a run with detections, batches of three."""
+    folder = tmp_path_factory.mktemp("detected")
+    data, _, done = run(root, store, folder)
+    return folder, data, done
+
+
+@pytest.fixture(scope="module")
+def truth(root, store, tmp_path_factory):
+    """Records of a run with true masks, batches of four."""
+    _, _, done = run(
+        root, store, tmp_path_factory.mktemp("truth"), masks=ground_truth_instances, batch_size=4
+    )
+    return all_records(done)
+
+
 @pytest.mark.parametrize("order", ["image", "object"])
 def test_poses_of_a_dataset(root, store, tmp_path, order):
     _, objects, done = run(root, store, tmp_path, order=order)
@@ -87,17 +104,17 @@ def test_poses_of_a_dataset(root, store, tmp_path, order):
     assert sorted(objects.loaded) == [1, 2]
 
 
-def test_each_pose_is_that_of_its_instance_alone(root, store, tmp_path):
-    _, _, together = run(root, store, tmp_path / "a", masks=ground_truth_instances, batch_size=4)
-    _, _, alone = run(root, store, tmp_path / "b", masks=ground_truth_instances, batch_size=1)
-    for a, b in zip(all_records(together), all_records(alone), strict=True):
+def test_each_pose_is_that_of_its_instance_alone(root, store, truth, tmp_path):
+    _, _, alone = run(root, store, tmp_path, masks=ground_truth_instances, batch_size=1)
+    for a, b in zip(truth, all_records(alone), strict=True):
         T = torch.tensor(a["R"]), torch.tensor(b["R"])
         assert torch.rad2deg(rotation_angle(*T)) < 0.05
         assert a["templates"] == b["templates"]
 
 
-def test_finished_batches_are_not_repeated(root, store, tmp_path, monkeypatch):
-    data, _, done = run(root, store, tmp_path)
+def test_finished_batches_are_not_repeated(root, store, detected, tmp_path, monkeypatch):
+    folder, data, done = detected
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
     path = shard_path(tmp_path, 0)
     lines = path.read_bytes().splitlines(keepends=True)
     path.write_bytes(b"".join(lines[:2]) + lines[2][:100])
@@ -145,7 +162,7 @@ def test_inference_does_not_touch_ground_truth(root, store, tmp_path, monkeypatc
     assert len(all_records(merge_shards(tmp_path / "run", data.batches))) == 2 * NUM_IMAGES
 
 
-def test_images_of_several_sizes_in_one_batch(root, store, tmp_path):
+def test_images_of_several_sizes_in_one_batch(root, store, truth, tmp_path):
     copy = shutil.copytree(root, tmp_path / "tiny")
     # Image 1 gets a margin on the right and below, which moves nothing.
     for folder, name in (("rgb", "000001.png"), ("mask_visib", "000001_000000.png")):
@@ -155,14 +172,14 @@ def test_images_of_several_sizes_in_one_batch(root, store, tmp_path):
             larger.paste(picture)
         larger.save(path)
     _, _, done = run(copy, store, tmp_path / "a", masks=ground_truth_instances, batch_size=5)
-    _, _, reference = run(root, store, tmp_path / "b", masks=ground_truth_instances, batch_size=5)
-    for a, b in zip(all_records(done), all_records(reference), strict=True):
+    for a, b in zip(all_records(done), truth, strict=True):
         assert a["valid"]
         assert torch.rad2deg(rotation_angle(torch.tensor(a["R"]), torch.tensor(b["R"]))) < 0.05
 
 
-def test_a_missing_batch_is_not_passed_over(root, store, tmp_path):
-    data, _, _ = run(root, store, tmp_path)
+def test_a_missing_batch_is_not_passed_over(detected, tmp_path):
+    folder, data, _ = detected
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
     path = shard_path(tmp_path, 0)
     path.write_bytes(b"".join(path.read_bytes().splitlines(keepends=True)[1:]))
     with pytest.raises(ValueError, match=r"1 of 4 batches are not in .* \(first: 0\)"):
@@ -211,18 +228,15 @@ def test_memory_limit(root, store, tmp_path):
     assert objects.loaded == [2]
 
 
-def test_workers_read_the_same_batches(root, store, tmp_path):
-    data, _, _ = run(root, store, tmp_path / "a")
-    again, _, _ = run(root, store, tmp_path / "b", num_workers=1)
-    records = [
-        [without_times(r) for r in all_records(merge_shards(folder, data.batches))]
-        for folder in (tmp_path / "a", tmp_path / "b")
-    ]
+def test_workers_read_the_same_batches(root, store, detected, tmp_path):
+    _, data, done = detected
+    again, _, done_again = run(root, store, tmp_path, num_workers=1)
+    records = [[without_times(r) for r in all_records(batches)] for batches in (done, done_again)]
     assert json.dumps(records[0]) == json.dumps(records[1])
     assert again.batches == data.batches
 
 
-def test_the_size_is_kept_in_the_folder_and_taken_from_there(root, store, tmp_path, monkeypatch):
+def test_the_size_is_kept_in_the_folder_and_taken_from_there(root, store, truth, tmp_path, monkeypatch):
     tried = []
     monkeypatch.setattr(foundpose.utils.batch_size, "free_memory", lambda device: 10**12)
     estimate = PoseEvaluation.estimate
@@ -236,8 +250,7 @@ def test_the_size_is_kept_in_the_folder_and_taken_from_there(root, store, tmp_pa
     assert tried[:3] == [1, 1, 2]
     assert json.loads((tmp_path / "batch_size.json").read_text()) == {"batch_size": 4}
     assert [len(batch) for batch in data.batches] == [4, 1]
-    _, _, fixed = run(root, store, tmp_path / "b", masks=ground_truth_instances, batch_size=4)
-    assert [without_times(r) for r in all_records(done)] == [without_times(r) for r in all_records(fixed)]
+    assert [without_times(r) for r in all_records(done)] == [without_times(r) for r in truth]
 
     # A run that goes on there has the same batches, however much memory there is now.
     (tmp_path / "batch_size.json").write_text('{"batch_size": 2}')
@@ -276,7 +289,8 @@ def test_no_clock_waits_unless_stages_are_timed(root, store, tmp_path, monkeypat
     objects = DatasetObjects(dataset, store)
     for time_stages in (True, False):
         folder = tmp_path / str(time_stages)
-        data = PoseDataModule(dataset, ground_truth_instances, objects, folder, TrueCoordinates(), 3)
+        settings = {"pictures": TrueCoordinates(), "batch_size": 3, "max_images": 1}
+        data = PoseDataModule(dataset, ground_truth_instances, objects, folder, **settings)
         module = PoseEvaluation(make_pipeline(), objects, folder, time_stages)
         waits.clear()
         module_trainer = trainer()
