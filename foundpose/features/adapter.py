@@ -137,13 +137,14 @@ class AdaptedExtractor(PatchExtractor):
             )
         self.extractor = extractor
         self.adapter = adapter
+        self.leaves_border = extractor.leaves_border
 
-    def forward(self, images: Tensor) -> PatchFeatures:
-        """Describe the patches of RGB images (B, 3, S, S) with values in [0, 1].
+    def forward(self, images: Tensor, border: int = 0) -> PatchFeatures:
+        """Describe the patches of RGB images (B, 3, S, S) with values in [0, 1], but for a border where asked to.
 
         Differentiable w.r.t. the adapter's parameters and whatever the inner extractor is differentiable w.r.t.
         """
-        features = self.extractor(images)
+        features = self.extractor(images, border) if border else self.extractor(images)
         patches = self.adapter(features.patches.movedim(1, -1)).movedim(-1, 1)
         return features._replace(patches=patches)
 

@@ -30,7 +30,14 @@ class PatchExtractor(nn.Module, ABC):
         channels: length C of a descriptor.
         stride: distance of neighbouring patch centres in pixels.
         offset: pixel coordinate of the first patch centre (integer coordinates are pixel centres).
+
+    Attributes:
+        leaves_border: whether ``forward`` takes a second argument, the number of rows and columns of patches along
+            each edge to leave out, which is less work: their descriptors are zero, and the others' do not depend on
+            what is seen there.
     """
+
+    leaves_border: bool = False
 
     def __init__(self, channels: int, stride: float, offset: float) -> None:
         super().__init__()

@@ -4,8 +4,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
-from torch import nn
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import pad
 
+from foundpose.features.base import PatchFeatures
 from foundpose.features.dinov2_checkpoints import (
     HUB_NAMES,
     VARIANTS,
@@ -14,7 +17,7 @@ from foundpose.features.dinov2_checkpoints import (
     read_original,
 )
 from foundpose.features.pretrained import PATCH_SIZE
-from foundpose.features.vision_transformer import VisionTransformer
+from foundpose.features.vision_transformer import VisionTransformer, split_tokens
 from foundpose.features.weights import Sizes, build_transformers, how_to_get_hub_weights
 from foundpose.features.wheel import WHEEL_VARIANT, wheel_weights
 
@@ -41,6 +44,7 @@ class DinoV2(VisionTransformer):
     default_variant = "vitl14_reg"
     default_depth = 0.75
     tail = "layernorm"
+    leaves_border = True
 
     @staticmethod
     def build_config(sizes: Sizes, blocks: int) -> Any:
@@ -84,6 +88,17 @@ class DinoV2(VisionTransformer):
         else:
             return super().load(weights, variant, sizes, blocks)
         return build_transformers(cls.build_config(sizes, blocks), None, state, str(weights))
+
+    def describe_within(self, pixels: Tensor, border: int) -> PatchFeatures:
+        """Tokens of the hooked block, which sees the inner ones only; each keeps its position embedding."""
+        n, prefix = pixels.shape[-1] // PATCH_SIZE, 1 + self.sizes["num_register_tokens"]
+        inner = slice(border, n - border)
+        tokens = self.model.get_submodule("embeddings")(pixels)
+        patches = tokens[:, prefix:].unflatten(1, (n, n))[:, inner, inner].flatten(1, 2)
+        blocks = self.model.get_submodule("encoder")(torch.cat([tokens[:, :prefix], patches], dim=1))
+        tokens = self.model.get_submodule(self.tail_name)(blocks.last_hidden_state)
+        features = split_tokens(tokens, prefix)
+        return features._replace(patches=pad(features.patches, 4 * (border,)))
 
     @staticmethod
     def adapt(model: Any, variant: str) -> None:

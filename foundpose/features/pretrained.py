@@ -70,7 +70,7 @@ class PretrainedExtractor(PatchExtractor):
         self.has_cls = has_cls
         self.precision = precision
         self.compiled = compile
-        self._compiled: Callable[[Tensor], PatchFeatures] | None = None
+        self._compiled: Callable[[Tensor, int], PatchFeatures] | None = None
         self.register_buffer("mean", torch.tensor(mean).view(3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(std).view(3, 1, 1), persistent=False)
 
@@ -90,24 +90,31 @@ class PretrainedExtractor(PatchExtractor):
             global descriptor (B, C) or None.
         """
 
-    def forward(self, images: Tensor) -> PatchFeatures:
+    def describe_within(self, pixels: Tensor, border: int) -> PatchFeatures:
+        """What :meth:`describe` returns, with the outer ``border`` rows and columns left out: they are zero."""
+        raise ValueError(f"{type(self).__name__} cannot leave out patches; border must be 0, got {border}")
+
+    def forward(self, images: Tensor, border: int = 0) -> PatchFeatures:
         """Describe the patches of images.
 
         Args:
             images: (B, 3, S, S) RGB in [0, 1]; S a multiple of 14 px.
+            border: rows and columns of patches along each edge to leave out; only where ``leaves_border``.
 
         Returns:
             Patch descriptors (B, C, S/14, S/14) and the global descriptor (B, C) or None, in the dtype of
             ``images``.
 
         Raises:
-            ValueError: wrong shape, type, size or range of ``images``.
+            ValueError: wrong shape, type, size or range of ``images``, or a ``border`` that leaves nothing.
 
         Differentiable w.r.t. ``images`` and the parameters.
         """
         check_images(images, multiple_of=PATCH_SIZE)
         size = images.shape[-1]
         n = size // PATCH_SIZE
+        if border and not 0 < 2 * border < n:
+            raise ValueError(f"border must leave some of the {n} × {n} patches, got {border}")
         if not len(images):  # transformers' attention cannot reshape an empty batch
             cls = images.new_zeros(0, self.channels) if self.has_cls else None
             return PatchFeatures(images.new_zeros(0, self.channels, n, n), cls)
@@ -118,18 +125,21 @@ class PretrainedExtractor(PatchExtractor):
         pixels = pixels.to(next(self.model.parameters()).dtype)
         autocast = autocast_dtype(self.precision, images.device)
         with torch.autocast(images.device.type, dtype=autocast, enabled=autocast is not None):
-            patches, cls = self._describe_compiled(pixels) if self.compiled else self.describe(pixels)
+            patches, cls = (self._run_compiled if self.compiled else self._run)(pixels, border)
         cls = None if cls is None else cls.to(images.dtype)
         return PatchFeatures(on_grid(patches, n).to(images.dtype), cls)
 
-    def _describe_compiled(self, pixels: Tensor) -> PatchFeatures:
-        """What :meth:`describe` returns, compiled on the first call."""
+    def _run(self, pixels: Tensor, border: int) -> PatchFeatures:
+        return self.describe_within(pixels, border) if border else self.describe(pixels)
+
+    def _run_compiled(self, pixels: Tensor, border: int) -> PatchFeatures:
+        """The same, compiled on the first call."""
         from torch._dynamo.exc import TorchDynamoException
 
         if self._compiled is None:
-            self._compiled = torch.compile(self.describe, dynamic=False)
+            self._compiled = torch.compile(self._run, dynamic=False)
         try:
-            return self._compiled(pixels)
+            return self._compiled(pixels, border)
         except TorchDynamoException as error:
             raise CompilationError(
                 f"torch.compile failed ({str(error).strip().splitlines()[0]}); on a CPU it needs a C++ compiler (g++ "

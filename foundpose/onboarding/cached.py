@@ -29,7 +29,7 @@ class CachedOnboarding:
 
     - ``renderings``: mesh, renderer, viewpoints, size, fill and distance of the templates;
     - ``patches``: stride, offset and grid of the extractor, erosion of the masks;
-    - ``descriptors``: fingerprint of the extractor, and the precision that it runs in;
+    - ``descriptors``: fingerprint of the extractor, the precision that it runs in, what it leaves out;
     - ``words``: number of components, settings of the visual words.
 
     An artefact is made only when one that needs it is missing: with ``patches`` and ``words`` there, the others may
@@ -86,6 +86,7 @@ class CachedOnboarding:
             "patches": self.artefacts.key("patches", patches),
             "extractor": self.fingerprint,
             "precision": extractor.running_precision(),
+            **({"border": onboarder.border} if onboarder.border else {}),
         }
         words = {
             "descriptors": self.artefacts.key("descriptors", descriptors),

@@ -57,6 +57,11 @@ def test_crop_of_the_paper_has_30_by_30_patches(name: str) -> None:
     assert (extractor.stride, extractor.offset, extractor.patch_grid(420).size) == (14, 6.5, 30)
 
 
+def test_networks_that_cannot_leave_patches_out_say_so() -> None:
+    with pytest.raises(ValueError, match="Sam cannot leave out patches; border must be 0, got 1"):
+        make("sam")(torch.rand(1, 3, 56, 56), 1)
+
+
 def test_sam_at_its_own_resolution() -> None:
     extractor = make("sam", layer=1, config={**SAM, "image_size": 1024, "window_size": 14})
     with torch.no_grad():

@@ -184,6 +184,54 @@ def test_position_embeddings_are_sampled_where_the_original_samples_them() -> No
     assert resample_position_embeddings(embeddings, n, n) is embeddings
 
 
+@pytest.mark.parametrize("variant", ["vits14", "vits14_reg"])
+def test_without_a_border_the_blocks_see_the_inner_patches_alone_in_their_places(variant, generator) -> None:
+    extractor = tiny(variant).double()
+    images = torch.rand(3, 3, 84, 84, generator=generator, dtype=torch.float64)
+    with torch.no_grad():
+        out = extractor(images, 2)
+        # The same by hand: tokens of rows and columns 2 and 3 of 6, behind cls and registers.
+        tokens = extractor.model.embeddings((images - extractor.mean) / extractor.std)
+        prefix = tokens.shape[1] - 36
+        cells = [14, 15, 20, 21]
+        tokens = tokens[:, [*range(prefix), *(prefix + cell for cell in cells)]]
+        for block in extractor.model.encoder.layer:
+            tokens = block(tokens)
+        tokens = extractor.model.layernorm(tokens)
+    patches = out.patches.flatten(2).mT.clone()
+    torch.testing.assert_close(patches[:, cells], tokens[:, prefix:], atol=1e-10, rtol=0)
+    torch.testing.assert_close(out.cls, tokens[:, 0], atol=1e-10, rtol=0)
+    patches[:, cells] = 0
+    assert not patches.any()
+    with torch.no_grad():
+        torch.testing.assert_close(extractor(images[1:2], 2).patches[0], out.patches[1], atol=1e-10, rtol=0)
+
+
+@pytest.mark.parametrize("variant", ["vits14", "vits14_reg"])
+def test_with_no_border_the_parts_make_the_whole(variant, images) -> None:
+    extractor = tiny(variant).double()
+    pixels = ((images.double() - extractor.mean) / extractor.std).requires_grad_()
+    part, whole = extractor.describe_within(pixels, 0), extractor.describe(pixels)
+    torch.testing.assert_close(part, whole, atol=1e-10, rtol=0)
+    gradients = [torch.autograd.grad(found.patches.square().sum(), pixels)[0] for found in (part, whole)]
+    torch.testing.assert_close(*gradients, atol=1e-9, rtol=1e-9)
+
+
+def test_gradients_leave_the_border_out(generator) -> None:
+    images = torch.rand(1, 3, 84, 84, generator=generator).requires_grad_()
+    extractor = tiny()
+    (gradient,) = torch.autograd.grad(extractor(images, 1).patches.square().sum(), images)
+    assert gradient[..., 14:70, 14:70].abs().amax(1).gt(0).float().mean() > 0.99
+    gradient[..., 14:70, 14:70] = 0
+    assert not gradient.any()
+
+
+def test_bad_borders_are_refused(images) -> None:
+    for border in (2, -1):
+        with pytest.raises(ValueError, match=f"must leave some of the 4 × 4 patches, got {border}"):
+            tiny()(images, border)
+
+
 @pytest.mark.parametrize(
     ("images", "message"),
     [

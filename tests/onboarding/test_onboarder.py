@@ -3,9 +3,9 @@ import pytest
 import torch
 from sklearn.decomposition import PCA
 
-from foundpose.features import CoordinateCode, DenseSift, PcaProjection
+from foundpose.features import AdaptedExtractor, CoordinateCode, DenseSift, DinoV2, PcaProjection
 from foundpose.geometry import SphereInplane, SuperFibonacci, project_points, transform_points
-from foundpose.onboarding import Onboarder, RepresentationStore
+from foundpose.onboarding import ArtefactStore, CachedOnboarding, Onboarder, RepresentationStore
 from foundpose.rendering import CoordinateRenderer, RaycastRenderer
 from foundpose.representation import ObjectRepresentation
 from foundpose.retrieval import SoftAssignBow, VisualWords
@@ -113,6 +113,8 @@ def test_bad_settings(blob):
         ({"idf_mode": "log"}, "idf_mode must be one of .*, got 'log'"),
         ({"fill": 1.2}, r"fill must be in \(0, 1\], got 1.2"),
         ({"batch_size": 0}, "batch_size must be at least 1, got 0"),
+        ({"margin": -1}, "margin must be at least 0, or null for whole templates, got -1"),
+        ({"margin": 1}, "margin is 1 but CoordinateCode describes pictures as a whole only"),
     ):
         with pytest.raises(ValueError, match=message):
             make_onboarder(**change)
@@ -156,3 +158,38 @@ def test_viewpoints_must_say_their_settings():
     viewpoints = TwoSides()
     viewpoints.settings = lambda: {"sides": 2}
     assert make_onboarder(viewpoints=viewpoints).settings()["viewpoints"] == "TwoSides(sides=2)"
+
+
+def test_templates_without_what_lies_far_from_the_object(blob, tmp_path):
+    sizes = {"hidden_size": 32, "num_hidden_layers": 2, "num_attention_heads": 4, "image_size": 70}
+    extractor = DinoV2("vits14", 1, seed=0, config=sizes, weights="random")
+    settings = {
+        "renderer": RaycastRenderer(),
+        "extractor": AdaptedExtractor(extractor),
+        "image_size": 140,
+        "viewpoints": SuperFibonacci(12),
+    }
+    whole = make_onboarder(**settings)
+    cut = make_onboarder(**settings, margin=1)
+    # 28 px, two patches, lie beside the object; of ten one is left out along each edge
+    assert (whole.border, cut.border) == (0, 1)
+    assert make_onboarder(**settings, margin=0).border == 2
+    made, of_whole = cut(blob, "blob"), whole(blob, "blob")
+    assert torch.equal(made.patch_index, of_whole.patch_index)
+    assert not torch.equal(made.template_cls, of_whole.template_cls)
+    render = RaycastRenderer()(blob, made.T_template_from_model, made.K_template, (140, 140))
+    with torch.no_grad():
+        images = (render.rgb * 255).round() / 255
+        features = extractor(images, 1)
+    rows = torch.repeat_interleave(torch.arange(12), made.template_offsets.diff())
+    raw = features.patches.flatten(2).mT[rows, made.patch_index.long()]
+    assert raw.any(1).all()  # none of the object's patches is left out
+    assert torch.allclose(made.projection(raw), made.descriptors, atol=1e-4)
+    # Neither representation nor artefacts are confused with those of whole templates.
+    assert (made.info.settings["border"], of_whole.info.settings.get("border")) == (1, None)
+    assert whole.settings() == make_onboarder(**settings, margin=2).settings()
+    store = ArtefactStore(tmp_path)
+    cached = CachedOnboarding(cut, store)
+    assert torch.equal(cached(blob, "blob").descriptors, made.descriptors)
+    facts = (CachedOnboarding(whole, store).facts(blob), cached.facts(blob))
+    assert [kind for kind in facts[0] if facts[0][kind] != facts[1][kind]] == ["descriptors", "words"]
