@@ -20,7 +20,6 @@ from foundpose.onboarding import Onboarder, RepresentationStore
 from foundpose.rendering import CoordinateRenderer
 from foundpose.representation import ObjectRepresentation
 from foundpose.retrieval import SoftAssignBow, VisualWords
-from tests.bop_dataset import make_bop_dataset
 
 MIB = 2**20
 linux_only = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
@@ -41,8 +40,8 @@ def make_store(folder: Path, mmap: bool = True, **settings) -> RepresentationSto
 
 
 @pytest.fixture(scope="module")
-def root(tmp_path_factory) -> Path:
-    return make_bop_dataset(tmp_path_factory.mktemp("bop") / "tiny")
+def root(tiny_bop, tmp_path_factory) -> Path:
+    return shutil.copytree(tiny_bop, tmp_path_factory.mktemp("objects") / "tiny")
 
 
 @pytest.fixture

@@ -268,15 +268,15 @@ def test_files_that_lack_the_codec_are_refused(stored, tmp_path) -> None:
         stored.with_storage("float16")
 
 
-def test_onboarding_with_codes_is_onboarding_and_then_coding(blob) -> None:
+def test_onboarding_with_a_storage_is_onboarding_and_then_storing_so(blob) -> None:
     stages: list[str] = []
-    for storage in ("int8", "pq"):
-        plain = make_onboarder()
+    plain = make_onboarder()(blob, "blob")
+    for storage in ("float16", "int8", "pq"):
         onboarder: Onboarder = make_onboarder(storage=storage, pq_subspaces=8)
         assert onboarder.settings()["storage"] == storage
         assert ("pq_subspaces" in onboarder.settings()) == (storage == "pq")
         direct = onboarder(blob, "blob", lambda stage, *_: stages.append(stage))
-        expected = plain(blob, "blob").with_storage(storage, 8)
+        expected = plain.with_storage(storage, 8)
         assert direct.info == expected.info
         for name, tensor in expected.state_dict().items():
             assert torch.equal(tensor, direct.state_dict()[name]), name

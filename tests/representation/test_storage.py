@@ -4,14 +4,12 @@ import pytest
 import torch
 
 from foundpose.features import CoordinateCode, PcaProjection
-from foundpose.geometry import SuperFibonacci, intrinsics_matrix, rotation_angle
-from foundpose.onboarding import Onboarder
+from foundpose.geometry import intrinsics_matrix, rotation_angle
 from foundpose.optimization import BarronLoss
 from foundpose.refinement import FeaturemetricAlignment, FeaturemetricRefiner
 from foundpose.rendering import CoordinateRenderer
 from foundpose.rendering.coordinates import render_coordinate_image
 from foundpose.representation import ObjectRepresentation
-from foundpose.retrieval import SoftAssignBow, VisualWords
 from tests.onboarding.test_onboarder import make_onboarder
 from tests.pipeline.test_foundpose import make_pipeline, pose_at
 
@@ -20,18 +18,9 @@ K = intrinsics_matrix(600.0, 605.0, 322.0, 236.0)
 
 
 @pytest.fixture(scope="module")
-def half(blob):
-    """As `oracle_blob`, with descriptors in float16."""
-    onboarder = Onboarder(
-        CoordinateRenderer(),
-        CoordinateCode(),
-        SuperFibonacci(100),
-        VisualWords(200),
-        SoftAssignBow(),
-        projection=PcaProjection(64),
-        storage="float16",
-    )
-    return onboarder(blob, "blob")
+def half(oracle_blob):
+    """As `oracle_blob`, with descriptors in float16; test_quantization.py: onboarding gives the same."""
+    return oracle_blob.with_storage("float16")
 
 
 def test_half_precision_halves_the_descriptors_and_nothing_else(oracle_blob, half, tmp_path):

@@ -36,7 +36,7 @@ class Recorder(PoseRefiner):
 
 @pytest.fixture(scope="module")
 def views(blob):
-    T = torch.stack([pose_at(blob, (300.0 + 8 * k, 230.0 - 5 * k), 700.0, k) for k in range(3)])
+    T = torch.stack([pose_at(blob, (300.0 + 8 * k, 230.0 - 5 * k), 700.0, k) for k in range(2)])
     images = torch.stack([render_coordinate_image(CoordinateRenderer(), [blob], [t], K, SIZE) for t in T])
     return images, CoordinateRenderer()(blob, T, K[None], SIZE).mask, T
 
@@ -48,9 +48,9 @@ def test_coarse_stage_finds_the_view_that_looks_like_the_picture(views, oracle_b
     parts = PerspectiveCrop(), CoordinateCode(), EveryTemplate(count + 3), TemplateHypotheses(scorer=scorer)
     recorder = Recorder()
     with torch.no_grad():
-        e = FoundPose(*parts)(images, K.expand(3, 3, 3), oracle_blob, masks=masks, meshes=blob)
+        e = FoundPose(*parts)(images, K.expand(2, 3, 3), oracle_blob, masks=masks, meshes=blob)
         some = FoundPose(*parts, recorder, refine=4)(
-            images, K.expand(3, 3, 3), oracle_blob, masks=masks, meshes=blob
+            images, K.expand(2, 3, 3), oracle_blob, masks=masks, meshes=blob
         )
     assert e.valid.all()
     T_true_crop = e.crops.T_crop_from_camera @ T_true
@@ -79,7 +79,7 @@ def test_scored_refinement_in_a_pipeline(views, oracle_blob, blob):
     assert pipeline.needs_meshes
     assert not FoundPose(*parts, solve).needs_meshes
     with torch.no_grad():
-        e = pipeline(images, K.expand(3, 3, 3), oracle_blob, masks=masks, meshes=blob)
+        e = pipeline(images, K.expand(2, 3, 3), oracle_blob, masks=masks, meshes=blob)
     assert e.refined.valid.all()
     # The refined pose that looks most like the picture is kept, and all have moved.
     torch.testing.assert_close(e.score, e.refined.score.amax(1))
