@@ -11,11 +11,14 @@ import foundpose, foundpose.evaluation.objects, foundpose.evaluation.report, fou
 assert not {"transformers", "pytorch_lightning", "pandas", "matplotlib"} & set(sys.modules), sys.modules.keys()
 import torch
 from tests.features.backbones import make
+
+import pytest
 for name in ("dinov3", "clip", "sam", "loftr", "s2dnet"):
     make(name)(torch.rand(1, 3, 28, 28))
 """
 
 
+@pytest.mark.slow
 def test_heavy_packages_come_with_what_needs_them_and_torchvision_never() -> None:
     """Also not where it is installed: transformers would use it if asked for an image processor."""
     done = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True)

@@ -40,6 +40,7 @@ def test_pq_alone_has_the_bytes_of_the_configuration(app, tmp_path) -> None:
     assert app["parse_storage"]("pq8", 16) == ("pq", 8)
 
 
+@pytest.mark.slow
 def test_rows_are_measured_as_far_as_the_disk_allows(app, tmp_path) -> None:
     cfg = config("counts=[3,2,2000]", "storages=[float32,pq8]", "crops=4", "disk_limit=0.01")
     rows = app["measure"](cfg, tmp_path / "objects")

@@ -403,6 +403,7 @@ def test_hub_that_cannot_be_reached_costs_less_than_five_seconds(hub) -> None:
     hub.check_quick_and_helpful()
 
 
+@pytest.mark.slow
 def test_mirror_of_the_hub_and_then_its_cache(hub, published) -> None:
     """A mirror is asked, and what it gave serves later when it has gone."""
     from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer

@@ -25,7 +25,7 @@ NUM_IMAGES = 10
     [
         (0.0, False, 0.97, 0.85, 1.5),
         pytest.param(0.3, False, 0.95, 0.8, 2.5, marks=pytest.mark.slow),
-        (0.0, True, 0.99, 0.95, 0.35),
+        pytest.param(0.0, True, 0.99, 0.95, 0.35, marks=pytest.mark.slow),
     ],
 )
 def test_true_coordinates_on_real_poses(

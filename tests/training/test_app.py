@@ -138,6 +138,7 @@ def test_the_extractor_written_is_complete(tmp_path):
     assert found.descriptors.temperature == pytest.approx(5.0 * math.e, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_train_resume_and_refuse(monkeypatch, tmp_path, capsys, bodies):
     measured = []
 

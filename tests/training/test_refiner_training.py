@@ -269,6 +269,7 @@ def run_app(monkeypatch, folder, *overrides):
     return json.loads((folder / "run" / "results.json").read_text())
 
 
+@pytest.mark.slow
 def test_train_resume_and_refuse(monkeypatch, tmp_path, capsys, bodies):
     write_ply(tmp_path / "cup.ply", bodies[0])
     cup = f"held_out={tmp_path / 'cup.ply'}"

@@ -9,8 +9,6 @@ import pytest
 from omegaconf import OmegaConf
 
 from ablation.runs import run_folder, run_once
-from foundpose import FoundPose
-from foundpose.config import build_method
 from tests.test_config import CONF, SIZES, SMALL_MEGAPOSE, load
 from tests.test_config import SMALL as SMALL_NETWORKS
 
@@ -37,8 +35,10 @@ def folder(tmp_path_factory):
     return tmp_path_factory.mktemp("experiments")
 
 
-def small(name, tiny_bop, folder):
-    """An experiment as it stands and as it is run here, and whether it renders and compares."""
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[] if name in QUICK else [pytest.mark.slow]) for name in EXPERIMENTS]
+)
+def test_experiment_runs(name, tiny_bop, folder):
     plain = load("ablate", f"experiment={name}")
     megapose = "MegaPose" in OmegaConf.to_yaml(plain)
     iterations = ["refiner.iterations", "refiners.megapose.iterations"]
@@ -58,20 +58,7 @@ def small(name, tiny_bop, folder):
         *(SMALL_MEGAPOSE if megapose else []),
         *(f"{key}=1" for key in iterations if megapose and OmegaConf.select(plain, key)),
     ]
-    return plain, load("ablate", *overrides), megapose
-
-
-@pytest.mark.parametrize("name", [name for name in EXPERIMENTS if name not in QUICK])
-def test_experiment_can_be_built(name, tiny_bop, folder):
-    _, cfg, _ = small(name, tiny_bop, folder)
-    assert isinstance(build_method(cfg).pipeline, FoundPose)
-
-
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[] if name in QUICK else [pytest.mark.slow]) for name in EXPERIMENTS]
-)
-def test_experiment_runs(name, tiny_bop, folder):
-    plain, cfg, megapose = small(name, tiny_bop, folder)
+    cfg = load("ablate", *overrides)
     run = run_folder(cfg)
     record = run_once(cfg, name)  # overrides that a user makes would end the row
     assert record.status == "finished", record.error

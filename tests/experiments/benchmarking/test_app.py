@@ -65,6 +65,7 @@ def test_everything_small(monkeypatch, tmp_path, capsys):
     assert {path.name for path in tmp_path.iterdir() if path.is_dir()} <= {"plots", ".hydra"}
 
 
+@pytest.mark.slow
 def test_comparison_with_an_earlier_run(monkeypatch, tmp_path, capsys):
     small = ["quick=true", "groups=[stages]", "batch_sizes=[1]", "measure.repeats=3"]
     run_app(monkeypatch, *small, f"hydra.run.dir={tmp_path / 'before'}")

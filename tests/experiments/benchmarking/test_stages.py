@@ -324,6 +324,7 @@ def test_ratio_and_agreement_of_a_slower_reference():
     assert row.times_faster > 2
 
 
+@pytest.mark.slow
 def test_curves(factory, workload):
     values = {
         "batch": [1, 3],
