@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+import pytest
+
 CODE = """
 import sys
 sys.modules["torchvision"] = None  # makes every import of it fail
@@ -11,8 +13,6 @@ import foundpose, foundpose.evaluation.objects, foundpose.evaluation.report, fou
 assert not {"transformers", "pytorch_lightning", "pandas", "matplotlib"} & set(sys.modules), sys.modules.keys()
 import torch
 from tests.features.backbones import make
-
-import pytest
 for name in ("dinov3", "clip", "sam", "loftr", "s2dnet"):
     make(name)(torch.rand(1, 3, 28, 28))
 """
