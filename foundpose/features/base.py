@@ -1,5 +1,6 @@
 """What every patch extractor provides."""
 
+import math
 from abc import ABC, abstractmethod
 from typing import NamedTuple
 
@@ -51,6 +52,28 @@ class PatchExtractor(nn.Module, ABC):
 
         Differentiable w.r.t. ``images`` and the extractor's parameters, unless a subclass says otherwise.
         """
+
+    def border(self, size: int, fill: float, margin: int | None) -> int:
+        """Rows and columns of patches along each edge of a picture that may be left out.
+
+        Args:
+            size: side of the picture in pixels.
+            fill: share of it that the object fills, in the middle.
+            margin: patches around that square that are described with it; None: all, so that none is left out.
+
+        Raises:
+            ValueError: a negative margin, or one though this extractor describes pictures as a whole only.
+        """
+        if margin is None:
+            return 0
+        if margin < 0:
+            raise ValueError(f"margin must be at least 0, or null for whole pictures, got {margin}")
+        if not self.leaves_border:
+            raise ValueError(
+                f"margin is {margin} but {type(self).__name__} describes pictures as a whole only; set margin=null"
+            )
+        outside = size * (1 - fill) / 2  # pixels
+        return max(0, math.floor(outside / self.stride + 1e-6) - margin)
 
     @abstractmethod
     def fingerprint(self) -> Fingerprint:

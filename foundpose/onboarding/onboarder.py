@@ -1,8 +1,6 @@
 """From a mesh to an object representation."""
 
-import copy
-import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from itertools import chain
@@ -12,9 +10,10 @@ import torch
 from torch import Tensor, nn
 
 from foundpose.features.base import PatchExtractor
-from foundpose.features.pca import CovarianceAccumulator, PcaProjection
+from foundpose.features.pca import PcaProjection
 from foundpose.onboarding.bags import describe_by_words
 from foundpose.onboarding.compression import dequantize, quantize
+from foundpose.onboarding.fitting import fit_words
 from foundpose.onboarding.prefetch import pin, prefetch, upload
 from foundpose.onboarding.scales import measure_scales
 from foundpose.onboarding.stages import (
@@ -34,8 +33,6 @@ from foundpose.utils.batch_size import BatchSize, check_batch_size, measure_batc
 from foundpose.utils.settings import Setting, identity
 
 _T = TypeVar("_T")
-# Sums and products round alike, whatever batches the extractor ran in.
-_ROWS_PER_BLOCK = 4096
 
 
 class Onboarder(nn.Module):
@@ -99,13 +96,6 @@ class Onboarder(nn.Module):
             raise ValueError(f"mask_erosion must be 0 or odd, got {mask_erosion}")
         if distance <= 1.0:
             raise ValueError(f"distance must be more than one diameter, got {distance}")
-        if margin is not None and margin < 0:
-            raise ValueError(f"margin must be at least 0, or null for whole templates, got {margin}")
-        if margin is not None and not extractor.leaves_border:
-            raise ValueError(
-                f"margin is {margin} but {type(extractor).__name__} describes pictures as a whole only; set "
-                "onboarder.margin=null"
-            )
         check_batch_size(batch_size)
         check_storage(storage, pq_subspaces, projection.num_components)
         for module in (renderer, viewpoints, words, bow):
@@ -124,7 +114,7 @@ class Onboarder(nn.Module):
         self._batch_size: BatchSize = batch_size
         self.storage: Storage = storage
         self.pq_subspaces = pq_subspaces
-        self.margin = margin
+        self.border = extractor.border(image_size, fill, margin)
 
     def settings(self) -> dict[str, Setting]:
         """Settings that the representation depends on, beside mesh and extractor."""
@@ -144,14 +134,6 @@ class Onboarder(nn.Module):
             **({"pq_subspaces": self.pq_subspaces} if self.storage == "pq" else {}),
             **({"border": self.border} if self.border else {}),
         }
-
-    @property
-    def border(self) -> int:
-        """Rows and columns of patches along each edge of a template that are left out, as ``margin`` has it."""
-        if self.margin is None:
-            return 0
-        outside = self.image_size * (1 - self.fill) / 2  # pixels
-        return max(0, math.floor(outside / self.extractor.stride + 1e-6) - self.margin)
 
     @property
     def device(self) -> torch.device:
@@ -304,25 +286,7 @@ class Onboarder(nn.Module):
             raw: descriptors (m, C) of batches of templates; the list is emptied on the way, which frees memory.
             report: is told of the progress.
         """
-        report("PCA", 0, 1)
-        accumulator = CovarianceAccumulator(self.extractor.channels, self.device)
-        for rows in _equal_blocks(raw):
-            accumulator.update(rows.to(self.device))
-        projection = copy.deepcopy(self.projection).to(self.device).fit(accumulator)
-        # Filled batch by batch: joining a list would take the memory twice.
-        descriptors = projection.mean.new_empty(accumulator.count, projection.num_components)
-        filled = 0
-        for rows in _equal_blocks(raw.pop(0) for _ in range(len(raw))):
-            projected = projection(rows.to(self.device))
-            descriptors[filled : filled + len(projected)] = projected
-            filled += len(projected)
-        report("PCA", 1, 1)
-
-        most = self.words.num_iterations
-        report("visual words", 0, most)
-        words = self.words(descriptors, lambda done, _: report("visual words", min(done, most - 1), most))
-        report("visual words", most, most)
-        return FittedWords(projection, words, descriptors)
+        return fit_words(raw, self.projection, self.words, self.device, report)
 
     def assemble(
         self,
@@ -377,17 +341,3 @@ class Onboarder(nn.Module):
         stored = representation.with_storage(self.storage, self.pq_subspaces)
         report("storage", 1, 1)
         return stored
-
-
-def _equal_blocks(batches: Iterable[Tensor]) -> Iterator[Tensor]:
-    """Rows (m, C) of all batches in blocks of one size, the last smaller."""
-    kept: list[Tensor] = []
-    for batch in batches:
-        kept.append(batch)
-        while sum(map(len, kept)) >= _ROWS_PER_BLOCK:
-            rows = torch.cat(kept) if len(kept) > 1 else kept[0]
-            yield rows[:_ROWS_PER_BLOCK]
-            kept = [rows[_ROWS_PER_BLOCK:]]
-    rest = torch.cat(kept) if kept else torch.empty(0, 0)
-    if len(rest) > 0:
-        yield rest

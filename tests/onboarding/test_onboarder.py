@@ -113,7 +113,7 @@ def test_bad_settings(blob):
         ({"idf_mode": "log"}, "idf_mode must be one of .*, got 'log'"),
         ({"fill": 1.2}, r"fill must be in \(0, 1\], got 1.2"),
         ({"batch_size": 0}, "batch_size must be at least 1, got 0"),
-        ({"margin": -1}, "margin must be at least 0, or null for whole templates, got -1"),
+        ({"margin": -1}, "margin must be at least 0, or null for whole pictures, got -1"),
         ({"margin": 1}, "margin is 1 but CoordinateCode describes pictures as a whole only"),
     ):
         with pytest.raises(ValueError, match=message):

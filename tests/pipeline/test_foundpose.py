@@ -303,6 +303,24 @@ def test_a_vision_transformer_takes_the_place_of_the_oracle(blob, transformer):
     assert_useful_gradients(extractor)
 
 
+@torch.no_grad()
+def test_a_margin_leaves_out_what_lies_around(blob, transformer):
+    """The crop's outer patches are not described; none of them is the object's."""
+    extractor, bow, representation = transformer
+    picture = cluttered_scene(blob, seed=3)
+    retriever = TemplateRetriever(bow, num_templates=3)
+    hypotheses = MatchAndSolve(PatchMatcher(), RansacPnp(iterations=50))
+    pipeline = FoundPose(PerspectiveCrop(), extractor, retriever, hypotheses, margin=1).eval()
+    assert pipeline.border == 5  # of 30 patches; 84 px, six patches, lie beside the object
+    e = pipeline(picture.image[None], picture.K[None], representation, masks=picture.mask[None])
+    expected = extractor(e.observation.crops.images, 5)
+    assert torch.equal(e.observation.features.patches, expected.patches)
+    on_mask = e.observation.grid.sample(e.observation.crops.masks[:, None])[0, 0] > 0.5
+    assert on_mask.any()
+    assert expected.patches[0].abs().sum(0)[on_mask].min() > 0
+    assert e.query.valid.sum() == on_mask.sum()
+
+
 def assert_useful_gradients(module):
     gradients = {name: p.grad for name, p in module.named_parameters() if p.grad is not None}
     assert len(gradients) > 10
