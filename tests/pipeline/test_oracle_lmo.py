@@ -20,13 +20,10 @@ OBJECT = 5
 NUM_IMAGES = 10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("noise", "refine", "least_mspd", "least_mssd", "most_degrees"),
-    [
-        (0.0, False, 0.97, 0.85, 1.5),
-        pytest.param(0.3, False, 0.95, 0.8, 2.5, marks=pytest.mark.slow),
-        pytest.param(0.0, True, 0.99, 0.95, 0.35, marks=pytest.mark.slow),
-    ],
+    [(0.0, False, 0.97, 0.85, 1.5), (0.3, False, 0.95, 0.8, 2.5), (0.0, True, 0.99, 0.95, 0.35)],
 )
 def test_true_coordinates_on_real_poses(
     lmo_root, representation, noise, refine, least_mspd, least_mssd, most_degrees

@@ -116,6 +116,7 @@ def test_few_settings_tell_groups_apart():
     assert _telling_apart(groups[:1], "words") == []
 
 
+@pytest.mark.slow
 def test_a_sweep_from_the_command_line(arguments, tmp_path, monkeypatch, capsys):
     """Runs are cached, shared, reported; a failed one stops no other and is tried again."""
     folder = tmp_path / "ablate"
