@@ -68,6 +68,7 @@ def test_load_composes_the_default_with_overrides() -> None:
     assert method.onboarder.extractor is method.pipeline.extractor
 
 
+@pytest.mark.slow
 def test_the_base_installation_is_enough_for_what_needs_no_extra(tmp_path: Path) -> None:
     code = (
         "import runpy, sys\n"

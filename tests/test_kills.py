@@ -1,7 +1,6 @@
 """Jobs that are killed at random moments and started again.
 
-Each is killed at two moments, and with ``FOUNDPOSE_ALL_KILLS=1`` in the environment at twenty. Those that run apps
-are among the slow tests.
+Each is killed at two moments, and with ``FOUNDPOSE_ALL_KILLS=1`` in the environment at twenty.
 """
 
 import json
@@ -18,6 +17,7 @@ from tests.bop_dataset import make_bop_dataset
 from tests.kill_jobs import JOBS, outcome, run_job
 from tests.processes import CONTEXT, finish
 
+pytestmark = pytest.mark.slow
 NUM_KILLS = 20 if os.environ.get("FOUNDPOSE_ALL_KILLS") else 2
 
 
@@ -45,13 +45,7 @@ def kill(name, folder, root, moment):
     return job
 
 
-APPS = ("evaluation", "ablation")
-
-
-@pytest.fixture(
-    scope="module",
-    params=[pytest.param(name, marks=[pytest.mark.slow] if name in APPS else []) for name in JOBS],
-)
+@pytest.fixture(scope="module", params=JOBS)
 def undisturbed(request, root, tmp_path_factory):
     """A job's name, what it leaves when nobody kills it, and the seconds that it takes."""
     folder = tmp_path_factory.mktemp(request.param) / "job"

@@ -382,6 +382,7 @@ def test_objects_are_found_in_a_folder_and_a_video(own_picture, monkeypatch, tmp
     assert "not found: " in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_detect_and_evaluate_what_was_found(representations, tiny_bop, monkeypatch, tmp_path, capsys):
     """From pictures to scores, where the regions are those of a file that does not say what they show."""
     proposals = tiny_bop / "detections" / "cnos-fastsam" / "detections.json"

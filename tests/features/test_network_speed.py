@@ -77,6 +77,7 @@ def test_crops_of_several_images_are_one_pass(generator, monkeypatch) -> None:
 
 @pytest.mark.skipif(not HAS_COMPILER, reason="needs a C++ compiler")
 @pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.slow
 def test_compiled_network_equals_the_network(device: str, images) -> None:
     plain, compiled = (tiny(layer=0, compile=compile).to(device) for compile in (False, True))
     with torch.no_grad():

@@ -399,6 +399,7 @@ def test_hub_that_does_not_answer_costs_less_than_five_seconds(hub) -> None:
         hub.check_quick_and_helpful()
 
 
+@pytest.mark.slow
 def test_hub_that_cannot_be_reached_costs_less_than_five_seconds(hub) -> None:
     hub.check_quick_and_helpful()
 

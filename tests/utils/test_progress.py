@@ -4,6 +4,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from foundpose.utils.progress import ProgressBars, say, track
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -63,6 +65,7 @@ def test_there_is_one_place_for_bars_and_for_standard_error():
         assert "enable_progress_bar: true" not in path.read_text(encoding="utf-8"), path
 
 
+@pytest.mark.slow
 def test_an_app_writes_results_to_standard_output_and_warnings_to_standard_error(tmp_path):
     code = (
         "import logging, os, warnings, hydra\n"

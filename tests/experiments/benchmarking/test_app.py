@@ -84,6 +84,7 @@ def test_comparison_with_an_earlier_run(monkeypatch, tmp_path, capsys):
     assert found[0].startswith("SLOWER: stages, matching, batch 1:")
 
 
+@pytest.mark.slow
 def test_other_stages_and_double_precision(monkeypatch, tmp_path):
     run_app(
         monkeypatch,

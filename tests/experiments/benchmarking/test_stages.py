@@ -151,6 +151,7 @@ def test_stages_have_the_configured_settings(factory):
     assert (usual.retriever.num_templates, len(usual.pnp.draws)) == (5, 400)
 
 
+@pytest.mark.slow
 def test_pipeline_runs_the_extractor_and_finds_poses(stages, workload):
     workload = with_crops(workload, 16)
     backbone = CountingExtractor()
