@@ -39,6 +39,9 @@ def main(cfg: DictConfig) -> None:
 
 def run(cfg: DictConfig, output: Path) -> None:
     """What :func:`main` does, in a folder; objects whose evidence is there already are not looked at again."""
+    share = cfg.share_right
+    if share is not None and not (isinstance(share, int | float) and 0 < share < 1):
+        raise ValueError(f"share_right must be between 0 and 1, or null, got {share}")
     meshes = meshes_to_train_on(cfg.meshes, OBJECTS, "meshes")
     if len(meshes) < 2:
         raise ValueError(f"meshes must be at least 2, so that one can be left out; got {len(meshes)}")
@@ -55,7 +58,7 @@ def run(cfg: DictConfig, output: Path) -> None:
     )
     right = torch.cat([part[1] for part in found])
     measured = reliability(left_out, right)
-    confidence = fit(cfg, found, cfg.share_right)
+    confidence = fit(cfg, found, share)
     write_confidence(output / "confidence" / "fitted.yaml", confidence)
     write_json(
         output / "results.json", {"right": float(right.float().mean()), "left_out": measured.to_json()}

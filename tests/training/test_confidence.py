@@ -88,6 +88,13 @@ def test_evidence_and_what_is_right(blob, oracle_blob):
         collect_evidence(pipeline, oracle_blob, blob, iter(scenes))
 
 
+def test_a_share_that_is_none_is_refused_before_the_work(tmp_path, monkeypatch, capsys):
+    with pytest.raises(SystemExit):
+        run_app(monkeypatch, "train_confidence", "share_right=2", f"hydra.run.dir={tmp_path / 'run'}")
+    assert "share_right must be between 0 and 1, or null, got 2" in capsys.readouterr().err
+    assert not (tmp_path / "run" / "evidence").exists()
+
+
 @pytest.mark.slow
 def test_the_app_fits_and_its_numbers_can_be_used(tmp_path, monkeypatch, capsys):
     """Two procedural objects in true coordinates, some absent; what is there already is not made again."""
