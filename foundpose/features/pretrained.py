@@ -16,6 +16,8 @@ from foundpose.features.weights import weights_checksum
 PATCH_SIZE = 14
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
+CPU_PIXELS = 2 * 420**2
+"""Pixels that a CPU runs the network on at a time: what lies between the layers then fits its cache."""
 
 
 class CompilationError(ValueError):
@@ -125,9 +127,16 @@ class PretrainedExtractor(PatchExtractor):
         pixels = pixels.to(next(self.model.parameters()).dtype)
         autocast = autocast_dtype(self.precision, images.device)
         with torch.autocast(images.device.type, dtype=autocast, enabled=autocast is not None):
-            patches, cls = (self._run_compiled if self.compiled else self._run)(pixels, border)
+            patches, cls = (self._run_compiled if self.compiled else self._run_in_parts)(pixels, border)
         cls = None if cls is None else cls.to(images.dtype)
         return PatchFeatures(on_grid(patches, n).to(images.dtype), cls)
+
+    def _run_in_parts(self, pixels: Tensor, border: int) -> PatchFeatures:
+        count = max(1, CPU_PIXELS // pixels[0, 0].numel())
+        if pixels.device.type != "cpu" or len(pixels) <= count:
+            return self._run(pixels, border)
+        patches, cls = zip(*(self._run(part, border) for part in pixels.split(count)), strict=True)
+        return PatchFeatures(torch.cat(patches), torch.cat(cls) if self.has_cls else None)
 
     def _run(self, pixels: Tensor, border: int) -> PatchFeatures:
         return self.describe_within(pixels, border) if border else self.describe(pixels)

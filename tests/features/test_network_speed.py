@@ -10,6 +10,7 @@ import torch._inductor.config
 from torch import Tensor, nn
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
+from foundpose.features import pretrained
 from foundpose.features.pretrained import CompilationError
 from foundpose.geometry import PerspectiveCrop, intrinsics_matrix
 from tests.features.backbones import TRANSFORMERS, make
@@ -55,7 +56,11 @@ def test_attention_is_fused_on_a_gpu() -> None:
             assert torch.isfinite(extractor(images).patches).all()
 
 
-def test_crops_of_several_images_are_one_pass(generator, monkeypatch) -> None:
+@pytest.mark.parametrize(("at_once", "expected"), [(None, [5]), (2, [2, 2, 1])])
+def test_crops_of_several_images_are_one_pass(at_once, expected, generator, monkeypatch) -> None:
+    """But for those that would not fit a CPU's cache together."""
+    if at_once is not None:
+        monkeypatch.setattr(pretrained, "CPU_PIXELS", at_once * 56**2)
     pictures = torch.rand(2, 3, 60, 80, generator=generator)
     K = intrinsics_matrix(90.0, 90.0, 39.5, 29.5).float().expand(2, 3, 3)
     masks = torch.zeros(5, 60, 80, dtype=torch.bool)
@@ -68,11 +73,12 @@ def test_crops_of_several_images_are_one_pass(generator, monkeypatch) -> None:
         lambda module, arguments, options: passes.append(len(options["pixel_values"])), with_kwargs=True
     )
     with torch.no_grad():
-        together = extractor(crops.images).patches
-    assert passes == [5]
+        together = extractor(crops.images)
+    assert passes == expected
     with torch.no_grad():
-        alone = torch.cat([extractor(image[None]).patches for image in crops.images])
-    torch.testing.assert_close(together, alone, atol=1e-5, rtol=1e-5)
+        alone = [extractor(image[None]) for image in crops.images]
+    for found, parts in zip(together, zip(*alone, strict=True), strict=True):
+        torch.testing.assert_close(found, torch.cat(parts), atol=1e-5, rtol=1e-5)
 
 
 @pytest.mark.skipif(not HAS_COMPILER, reason="needs a C++ compiler")
