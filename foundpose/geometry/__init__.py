@@ -15,6 +15,7 @@ from foundpose.geometry.cameras import (
 from foundpose.geometry.crop import Crops, PerspectiveCrop
 from foundpose.geometry.deviation import PoseDeviation, perturbed_poses, pose_deviation
 from foundpose.geometry.intrinsics import Camera, CameraError, check_camera, read_camera
+from foundpose.geometry.masks import grow_masks
 from foundpose.geometry.patch_grid import PatchGrid
 from foundpose.geometry.symmetries import (
     Symmetries,
@@ -58,6 +59,7 @@ __all__ = [
     "camera_on_boxes",
     "check_camera",
     "discretise",
+    "grow_masks",
     "intrinsics_matrix",
     "invert_transform",
     "make_transform",

@@ -3,12 +3,12 @@
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from foundpose.geometry import (
     boxes_from_points,
     camera_on_boxes,
+    grow_masks,
     invert_transform,
     make_transform,
     pixel_grid,
@@ -100,11 +100,7 @@ def register_patches(
     scale, shift, n = 1 / grid.stride, -grid.offset / grid.stride, grid.size
     K_grid = K.new_tensor([[scale, 0.0, shift], [0.0, scale, shift], [0, 0, 1]]) @ K
     render = renderer(mesh, T, K_grid, (n, n))
-    inside = masks.to(K.dtype)[:, None]
-    if erosion > 1:
-        # Beyond the border counts as inside, so that only the silhouette is eroded.
-        outside = F.max_pool2d(1.0 - inside, (erosion, 1), stride=1, padding=(erosion // 2, 0))
-        inside = 1.0 - F.max_pool2d(outside, (1, erosion), stride=1, padding=(0, erosion // 2))
+    inside = grow_masks(masks, -(erosion // 2)).to(K.dtype)[:, None]
     valid = render.mask & (grid.sample(inside)[:, 0] > 0.999)
     pixels = pixel_grid(n, n, K.device, K.dtype).reshape(1, -1, 2)
     points_template = unproject_pixels(pixels, render.depth.flatten(1), K_grid)

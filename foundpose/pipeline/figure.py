@@ -4,7 +4,7 @@ import torch
 from PIL import Image, ImageDraw
 from torch import Tensor
 
-from foundpose.geometry import project_points, resize_intrinsics, transform_points
+from foundpose.geometry import grow_masks, project_points, resize_intrinsics, transform_points
 from foundpose.geometry.warp import sample_pixels, warped_pixels
 from foundpose.pipeline.results import PoseEstimates, PoseStatus
 from foundpose.refinement import Observation
@@ -57,11 +57,10 @@ class ObjectView:
         pixels, depth = project_points(transform_points(T, self.points), K)
         u, v = pixels.round().long().unbind(1)
         seen = (depth > 0) & (u >= 0) & (u < size[1]) & (v >= 0) & (v < size[0])
-        mask = torch.zeros(size)
-        mask[v[seen], u[seen]] = 1.0
+        mask = torch.zeros(size, dtype=torch.bool)
+        mask[v[seen], u[seen]] = True
         # Points lie apart: what is between them belongs to the object.
-        closed = torch.nn.functional.max_pool2d(mask[None, None], 5, 1, 2)
-        return -torch.nn.functional.max_pool2d(-closed, 5, 1, 2)[0, 0] > 0.5
+        return grow_masks(grow_masks(mask, 2), -2)
 
 
 @torch.no_grad()

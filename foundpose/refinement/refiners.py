@@ -3,10 +3,9 @@
 from collections.abc import Sequence
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
-from foundpose.geometry import project_points, transform_points
+from foundpose.geometry import grow_masks, project_points, transform_points
 from foundpose.refinement.base import Observation, PoseProposals, PoseRefiner
 from foundpose.refinement.cost import AlignmentProblem, FeatureMaps
 from foundpose.refinement.featuremetric import FeaturemetricAlignment
@@ -87,19 +86,14 @@ class FeaturemetricRefiner(PoseRefiner):
 
 def patches_on_mask(T: Tensor, problem: AlignmentProblem, masks: Tensor, margin: float) -> Tensor:
     """Which patches (n, P) poses (n, 4, 4) put on the crops' masks (B, S, S), or less than ``margin`` pixels away."""
+    size = masks.shape[-1]
     with torch.no_grad():
-        points = transform_points(T, problem.points_model)
-        pixels, depth = project_points(points, problem.K)
-        inside = (masks > 0.5).to(pixels.dtype)[:, None]
-        if margin >= 1:
-            # A square in two steps.
-            r = int(margin)
-            inside = F.max_pool2d(inside, (2 * r + 1, 1), stride=1, padding=(r, 0))
-            inside = F.max_pool2d(inside, (1, 2 * r + 1), stride=1, padding=(0, r))
-        grid = ((2.0 * pixels + 1.0) / masks.shape[-1] - 1.0).nan_to_num(nan=-2.0).clamp(-2.0, 2.0)
-        per_crop = grid.unflatten(0, (len(masks), -1))
-        share = F.grid_sample(inside, per_crop.flatten(1, 2)[:, None], mode="nearest", align_corners=False)
-        return (share.reshape(depth.shape) > 0.5) & (depth > 0)
+        pixels, depth = project_points(transform_points(T, problem.points_model), problem.K)
+        column, row = pixels.nan_to_num(nan=-1.0).clamp(-1.0, size).round().long().unbind(-1)
+        in_crop = (column >= 0) & (column < size) & (row >= 0) & (row < size)
+        near = grow_masks(masks > 0.5, int(margin))
+        found = near[problem.map_index.unsqueeze(-1), row.clamp(0, size - 1), column.clamp(0, size - 1)]
+        return found & in_crop & (depth > 0)
 
 
 def alignment_problem(

@@ -14,6 +14,7 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 
 from foundpose.geometry import (
+    grow_masks,
     intrinsics_matrix,
     make_transform,
     pixel_rays,
@@ -245,6 +246,6 @@ def _hide_corner(
     hidden = along > along.float().quantile(1.0 - share)
     cover = torch.zeros_like(mask)
     cover[rows[hidden], columns[hidden]] = True
-    cover = F.max_pool2d(cover.float()[None], 9, stride=1, padding=4)[0] > 0
+    cover = grow_masks(cover, 4)
     color = torch.rand(3, 1, 1, generator=generator)
     return torch.where(cover, color, image), mask & ~cover

@@ -10,6 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from foundpose.bop.errors import mspd
+from foundpose.geometry import grow_masks
 from foundpose.pipeline import RIGHT_PIXELS, FoundPose, PoseEvidence
 from foundpose.rendering import Mesh, Renderer
 from foundpose.representation import ObjectRepresentation
@@ -66,7 +67,7 @@ class ConfidencePictures:
         hidden = self.hidden[0] + d * (self.hidden[1] - self.hidden[0])
         width = height * 4 // 3
         scene = cluttered_scene(shown, seed, height, width, hidden, renderer, self.light)
-        mask = _grown(scene.mask, round((2.0 * e - 1.0) * self.mask_error))
+        mask = grow_masks(scene.mask, round((2.0 * e - 1.0) * self.mask_error))
         if int(mask.sum()) < 16:
             return None
         left, top = int(f * (_WIDTH - width)), int(f * (_HEIGHT - height))
@@ -75,16 +76,6 @@ class ConfidencePictures:
         K[:2, 2] += torch.tensor([left, top])
         T = torch.full_like(scene.T_camera_from_model, torch.nan) if absent else scene.T_camera_from_model
         return SyntheticScene(F.pad(scene.image, pad), K, F.pad(mask, pad), T)
-
-
-def _grown(mask: Tensor, pixels: int) -> Tensor:
-    """A mask (H, W) grown, or shrunk, by a square."""
-    if pixels == 0:
-        return mask
-    inside = mask if pixels > 0 else ~mask
-    size = 2 * abs(pixels) + 1
-    inside = F.max_pool2d(inside[None].float(), size, stride=1, padding=abs(pixels))[0] > 0
-    return inside if pixels > 0 else ~inside
 
 
 @torch.no_grad()

@@ -5,11 +5,10 @@ from colorsys import hsv_to_rgb
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from PIL import Image, ImageDraw
 from torch import Tensor
 
-from foundpose.geometry import project_points, transform_points
+from foundpose.geometry import grow_masks, project_points, transform_points
 
 Color = tuple[float, float, float]
 
@@ -31,9 +30,7 @@ def draw_contour(image: Tensor, mask: Tensor, color: Color, width: int = 2) -> T
     Returns:
         A new (3, H, W) image.
     """
-    inside = mask.to(image.dtype)[None, None]
-    grown = F.max_pool2d(inside, 2 * width + 1, stride=1, padding=width)
-    outline = ((grown - inside) > 0)[0]
+    outline = grow_masks(mask, width) & ~mask
     return torch.where(outline, image.new_tensor(color)[:, None, None], image)
 
 
