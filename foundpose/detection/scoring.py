@@ -169,6 +169,7 @@ class CropScorer(ProposalScorer):
         rivals: so much of a region's lead over the other objects is added.
         shape: weight of the shape beside the descriptors' 1; 0 is CNOS's score.
         batch_size: crops that are described at a time.
+        margin: describe them without what lies around, as :class:`foundpose.FoundPose` does.
 
     Source: Nguyen et al., "CNOS: A Strong Baseline for CAD-based Novel Object Segmentation", 2023. Geometry beside it
     is after Lin et al., "SAM-6D", 2024, who compare boxes.
@@ -182,6 +183,7 @@ class CropScorer(ProposalScorer):
         rivals: float = 0.5,
         shape: float = 0.25,
         batch_size: int = 16,
+        margin: int | None = None,
     ) -> None:
         super().__init__()
         _check(views, shape)
@@ -195,6 +197,7 @@ class CropScorer(ProposalScorer):
         self.rivals = rivals
         self.shape = shape
         self.batch_size = batch_size
+        self.margin = margin
         self.of_templates = ViewsOfTemplates()
 
     def forward(
@@ -223,7 +226,8 @@ class CropScorer(ProposalScorer):
     ) -> Tensor:
         """Similarity (B, O) of masks (B, H, W) and objects."""
         crops = self.crop(pictures.images, pictures.K, masks, None, image)
-        described = extractor(crops.images)
+        border = extractor.border(self.crop.size, self.crop.fill, self.margin)
+        described = extractor.within(crops.images, border)
         share = extractor.patch_grid(self.crop.size).sample(crops.masks[:, None]).flatten(1)
         inside = (share > 0.5).to(described.patches)[:, None]
         patches = described.patches.flatten(2)

@@ -144,7 +144,7 @@ class AdaptedExtractor(PatchExtractor):
 
         Differentiable w.r.t. the adapter's parameters and whatever the inner extractor is differentiable w.r.t.
         """
-        features = self.extractor(images, border) if border else self.extractor(images)
+        features = self.extractor.within(images, border)
         patches = self.adapter(features.patches.movedim(1, -1)).movedim(-1, 1)
         return features._replace(patches=patches)
 

@@ -75,6 +75,11 @@ class PatchExtractor(nn.Module, ABC):
         outside = size * (1 - fill) / 2  # pixels
         return max(0, math.floor(outside / self.stride + 1e-6) - margin)
 
+    def within(self, images: Tensor, border: int) -> PatchFeatures:
+        """Describe pictures as :meth:`forward` does, but for a border of so many patches, see :meth:`border`."""
+        features: PatchFeatures = self(images, border) if border else self(images)
+        return features
+
     @abstractmethod
     def fingerprint(self) -> Fingerprint:
         """Settings that change the descriptors; an object representation is valid for one fingerprint only."""

@@ -266,7 +266,7 @@ class Onboarder(nn.Module):
         template = upload(pin(template, self.device), self.device)
         cells = upload(patches.patch_index, self.device)
         images = dequantize(upload(levels, self.device), self.renderer.bits)
-        features = self.extractor(images, self.border) if self.border else self.extractor(images)
+        features = self.extractor.within(images, self.border)
         descriptors = features.patches.flatten(2).transpose(1, 2)[template, cells].float()
         cls = descriptors.new_empty(len(levels), 0) if features.cls is None else features.cls.float()
         return RawDescriptors(descriptors, cls)

@@ -103,7 +103,7 @@ class FoundPose(nn.Module):
         if len(crops.images) == 0:
             raise ValueError("there is nothing to estimate: masks or boxes have length 0")
         groups = ObjectGroups(objects, object_index, len(crops.images), crops.images.device)
-        features = self.extractor(crops.images, self.border) if self.border else self.extractor(crops.images)
+        features = self.extractor.within(crops.images, self.border)
         # Autocast is for the extractor: elsewhere half precision moves points and changes neighbours.
         with torch.autocast(crops.images.device.type, enabled=False):
             observation = Observation(
@@ -153,11 +153,11 @@ class FoundPose(nn.Module):
 
     def _warn_of_other_settings(self, representation: ObjectRepresentation) -> None:
         """Templates and crops can be compared, but badly, if they were made with other settings."""
-        mine: dict[str, str | float] = {"fill": self.crop.fill}
+        mine: dict[str, str | float] = {"fill": self.crop.fill, "border": self.border}
         if isinstance(self.retriever, Retriever):
             mine |= self.retriever.onboarding_settings()
         for name, value in mine.items():
-            theirs = representation.info.settings.get(name, value)
+            theirs = representation.info.settings.get(name, 0 if name == "border" else value)
             if theirs != value:
                 warn_caller(
                     f"{representation.info.name!r} was onboarded with {name}={theirs}, the pipeline uses {value}; "

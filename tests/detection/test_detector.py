@@ -1,3 +1,5 @@
+from typing import Any
+
 import pytest
 import torch
 import torch.nn.functional as F
@@ -15,6 +17,7 @@ from foundpose.detection import (
     pad_proposals,
 )
 from foundpose.detection.scoring import ViewsOfTemplates
+from foundpose.features import PatchFeatures
 from foundpose.geometry import PerspectiveCrop
 from foundpose.representation import ObjectRepresentation
 from tests.detection.conftest import SIDE, Colors, K, Scene
@@ -31,7 +34,7 @@ class Known(Proposer):
         return pad_proposals([self.masks] * len(pictures.images))
 
 
-def crop_scorer(**changes: float) -> CropScorer:
+def crop_scorer(**changes: Any) -> CropScorer:
     return CropScorer(PerspectiveCrop(size=SIDE, background="black"), **changes)
 
 
@@ -77,19 +80,33 @@ def with_lead(similarity: Tensor) -> Tensor:
     return similarity + 0.5 * torch.stack(lead, dim=1)
 
 
-def test_crop_scores_as_written_out(scene: Scene) -> None:
-    """The definition, for one region and object at a time."""
-    scorer, masks = crop_scorer(views=3, patches=0.25, rivals=0.5, shape=0.3), distractors(scene)
+class InnerColors(Colors):
+    """Tells in its global descriptor how much it was asked to leave out."""
+
+    leaves_border = True
+
+    def forward(self, images: Tensor, border: int = 0) -> PatchFeatures:
+        features = super().forward(images)
+        assert features.cls is not None
+        return features._replace(cls=features.cls + border)
+
+
+@pytest.mark.parametrize(("margin", "border"), [(None, 0), (1, 1), (0, 2)])
+def test_crop_scores_as_written_out(margin: int | None, border: int, scene: Scene) -> None:
+    """The definition, for one region and object at a time; the object fills six of ten patches."""
+    extractor = InnerColors()
+    scorer = crop_scorer(views=3, patches=0.25, rivals=0.5, shape=0.3, margin=margin)
+    masks = distractors(scene)
     objects = list(scene.objects.values())
     proposals = pad_proposals([masks])
     wanted = torch.ones(1, len(masks), len(objects), dtype=torch.bool)
     wanted[0, 2, 1] = False
-    score = scorer(Pictures(scene.image[None], K[None]), proposals, objects, Colors(), wanted)
+    score = scorer(Pictures(scene.image[None], K[None]), proposals, objects, extractor, wanted)
     expected = torch.zeros(len(masks), len(objects))
     crop = PerspectiveCrop(size=SIDE, background="black")
     for i, mask in enumerate(masks):
         cut = crop(scene.image[None], K[None], mask[None])
-        said = Colors()(cut.images)
+        said = extractor(cut.images, border)
         inside = F.avg_pool2d(cut.masks[None], 2, 1)[0, 0, 6::14, 6::14] > 0.5  # the patches' centres, at 6.5
         mean = said.patches[0][:, inside].mean(dim=1)
         for o, obj in enumerate(objects):

@@ -312,7 +312,8 @@ def test_a_margin_leaves_out_what_lies_around(blob, transformer):
     hypotheses = MatchAndSolve(PatchMatcher(), RansacPnp(iterations=50))
     pipeline = FoundPose(PerspectiveCrop(), extractor, retriever, hypotheses, margin=1).eval()
     assert pipeline.border == 5  # of 30 patches; 84 px, six patches, lie beside the object
-    e = pipeline(picture.image[None], picture.K[None], representation, masks=picture.mask[None])
+    with pytest.warns(UserWarning, match="onboarded with border=0, the pipeline uses 5"):
+        e = pipeline(picture.image[None], picture.K[None], representation, masks=picture.mask[None])
     expected = extractor(e.observation.crops.images, 5)
     assert torch.equal(e.observation.features.patches, expected.patches)
     on_mask = e.observation.grid.sample(e.observation.crops.masks[:, None])[0, 0] > 0.5
