@@ -35,7 +35,7 @@ class EvaluationReport:
         thumbnails: so many of the worst get a small picture (3 KB each).
     """
 
-    def __init__(self, figures: int = 40, thumbnails: int = 1000) -> None:
+    def __init__(self, figures: int = 20, thumbnails: int = 1000) -> None:
         if min(figures, thumbnails) < 0:
             raise ValueError(f"figures and thumbnails must not be negative, got {figures} and {thumbnails}")
         import plotly  # noqa: F401  # if it is missing, that is found before the work

@@ -85,7 +85,7 @@ class PatchExtractor(nn.Module, ABC):
         """Settings that change the descriptors; an object representation is valid for one fingerprint only."""
 
     def running_precision(self) -> str | None:
-        """Type that inference rounds to inside ("bf16", "fp16"); None for that of the weights.
+        """Type that inference rounds to inside ("bf16", "fp16", "int8"); None for that of the weights.
 
         What was made in one type is not reused in another, though the fingerprint, and so what may be compared with
         what, is the same.

@@ -1,19 +1,21 @@
 """Which precision a network runs in, and what the processor is good at."""
 
+import warnings
 from typing import Literal, get_args
 
 import torch
+from torch import nn
 
-Precision = Literal["auto", "bf16", "fp16"]
+Precision = Literal["auto", "bf16", "fp16", "int8"]
 _AUTOCAST: dict[str, torch.dtype] = {"bf16": torch.bfloat16, "fp16": torch.float16}
 # Instructions that multiply bfloat16 matrices.
 _BFLOAT16_INSTRUCTIONS = {"amx_bf16", "avx512_bf16"}
 
 
 def check_precision(precision: str | None) -> None:
-    """Raise ValueError for a precision that is none of None, 'auto', 'bf16' and 'fp16'."""
+    """Raise ValueError for a precision that is none of None, 'auto', 'bf16', 'fp16' and 'int8'."""
     if precision is not None and precision not in get_args(Precision):
-        raise ValueError(f"precision must be None, 'auto', 'bf16' or 'fp16', got {precision!r}")
+        raise ValueError(f"precision must be None, 'auto', 'bf16', 'fp16' or 'int8', got {precision!r}")
 
 
 def autocast_precision(precision: str | None, device: torch.device) -> str | None:
@@ -39,7 +41,19 @@ def autocast_dtype(precision: str | None, device: torch.device) -> torch.dtype |
     if precision == "auto" and torch.is_grad_enabled():
         return None
     resolved = autocast_precision(precision, device)
-    return None if resolved is None else _AUTOCAST[resolved]
+    return None if resolved is None else _AUTOCAST.get(resolved)
+
+
+def quantize_linear_layers(model: nn.Module) -> None:
+    """Let the linear layers of a network in float32 on the CPU multiply 8-bit integers; no gradient is left.
+
+    Weights get one scale for each layer, inputs one for each call (PyTorch's dynamic quantisation).
+    """
+    from torch.ao.quantization import quantize_dynamic
+
+    with warnings.catch_warnings():  # both the function and its tensors are to move to another package
+        warnings.simplefilter("ignore")
+        quantize_dynamic(model, {nn.Linear}, dtype=torch.qint8, inplace=True)
 
 
 def has_fast_bfloat16(device: torch.device) -> bool:

@@ -1,5 +1,6 @@
 """What the extractors that run a pretrained network have in common."""
 
+import copy
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Any, Self, cast
@@ -9,7 +10,12 @@ from torch import Tensor, nn
 
 from foundpose.features.base import Fingerprint, PatchExtractor, PatchFeatures
 from foundpose.features.checks import check_images
-from foundpose.features.precision import autocast_dtype, autocast_precision, check_precision
+from foundpose.features.precision import (
+    autocast_dtype,
+    autocast_precision,
+    check_precision,
+    quantize_linear_layers,
+)
 from foundpose.features.resample import on_grid, resize_images
 from foundpose.features.weights import weights_checksum
 
@@ -38,8 +44,9 @@ class PretrainedExtractor(PatchExtractor):
         settings: what the fingerprint says besides the weights.
         has_cls: whether ``describe`` gives a global descriptor.
         precision: ``"bf16"`` or ``"fp16"`` runs the network under autocast, ``"auto"`` under the type that the device
-            gains from and without gradients only (:func:`foundpose.features.precision.autocast_dtype`), None in the
-            weights' own precision.
+            gains from and without gradients only (:func:`foundpose.features.precision.autocast_dtype`), ``"int8"``
+            its linear layers in 8-bit integers, on a CPU and without gradients only, None in the weights' own
+            precision.
         mean: of the network's training images, per channel, for values in [0, 1].
         std: their standard deviation.
         compile: compile the network with ``torch.compile``, anew for each size and number of images (which takes half
@@ -47,7 +54,7 @@ class PretrainedExtractor(PatchExtractor):
             the network as it is. A copy or an unpickled extractor compiles again.
 
     Raises:
-        ValueError: unknown precision.
+        ValueError: unknown precision; "int8" with ``compile``, or (on a call) with a network that is not on a CPU.
         CompilationError: (on a call) ``compile`` where there is no compiler.
     """
 
@@ -66,6 +73,8 @@ class PretrainedExtractor(PatchExtractor):
         compile: bool = False,
     ) -> None:
         check_precision(precision)
+        if compile and precision == "int8":
+            raise ValueError("precision 'int8' cannot be compiled; set compile=false, or another precision")
         super().__init__(channels, stride=PATCH_SIZE, offset=(PATCH_SIZE - 1) / 2)
         self.model = model.eval()
         self.settings = dict(settings)
@@ -73,6 +82,7 @@ class PretrainedExtractor(PatchExtractor):
         self.precision = precision
         self.compiled = compile
         self._compiled: Callable[[Tensor, int], PatchFeatures] | None = None
+        self._int8: tuple[tuple[object, ...], Self] | None = None  # not a submodule: its weights are these
         self.register_buffer("mean", torch.tensor(mean).view(3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(std).view(3, 1, 1), persistent=False)
 
@@ -112,6 +122,8 @@ class PretrainedExtractor(PatchExtractor):
 
         Differentiable w.r.t. ``images`` and the parameters.
         """
+        if self.precision == "int8" and not torch.is_grad_enabled():
+            return self._in_int8().forward(images, border)  # hooks of this module are called once
         check_images(images, multiple_of=PATCH_SIZE)
         size = images.shape[-1]
         n = size // PATCH_SIZE
@@ -130,6 +142,21 @@ class PretrainedExtractor(PatchExtractor):
             patches, cls = (self._run_compiled if self.compiled else self._run_in_parts)(pixels, border)
         cls = None if cls is None else cls.to(images.dtype)
         return PatchFeatures(on_grid(patches, n).to(images.dtype), cls)
+
+    def _in_int8(self) -> Self:
+        """A copy that multiplies 8-bit integers, of the weights as they are now."""
+        weights = list(self.model.parameters())
+        if weights[0].device.type != "cpu":
+            raise ValueError(
+                f"precision 'int8' is for CPUs, the network is on {weights[0].device}; use 'auto'"
+            )
+        state = (id(self.model), *((w.dtype, 0 if w.is_inference() else w._version) for w in weights))
+        if self._int8 is None or self._int8[0] != state:
+            quantized = copy.deepcopy(self)
+            quantized.precision = None
+            quantize_linear_layers(quantized.model)
+            self._int8 = state, quantized
+        return self._int8[1]
 
     def _run_in_parts(self, pixels: Tensor, border: int) -> PatchFeatures:
         count = max(1, CPU_PIXELS // pixels[0, 0].numel())
@@ -157,10 +184,10 @@ class PretrainedExtractor(PatchExtractor):
 
     def __getstate__(self) -> dict[str, Any]:
         # What is compiled runs the weights of the extractor that it was compiled for.
-        return {**cast(dict[str, Any], super().__getstate__()), "_compiled": None}
+        return {**cast(dict[str, Any], super().__getstate__()), "_compiled": None, "_int8": None}
 
     def running_precision(self) -> str | None:
-        """ "bf16" or "fp16" where inference runs under autocast, with "auto" resolved for the network's device."""
+        """ "bf16", "fp16" or "int8" where inference does, with "auto" resolved for the network's device."""
         return autocast_precision(self.precision, self.mean.device)
 
     def fingerprint(self) -> Fingerprint:

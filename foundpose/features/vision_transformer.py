@@ -38,7 +38,8 @@ class VisionTransformer(PretrainedExtractor):
         weights: ``"hub"`` (Hugging Face hub or its cache), a folder in transformers' format, ``"random"`` (with
             ``seed``; for tests and dry runs), or what the family has besides.
         precision: ``"bf16"`` or ``"fp16"`` runs the model under autocast, ``"auto"`` in what the device gains from
-            (in inference only); None in the weights' own precision.
+            (in inference only), ``"int8"`` its linear layers in 8-bit integers (likewise, on a CPU); None in the
+            weights' own precision.
         seed: of random weights, and only of these.
         config: sizes that differ from the variant's, names as in ``variants``.
         compile: compile the model, see ``PretrainedExtractor``.

@@ -1,3 +1,5 @@
+import copy
+import pickle
 from pathlib import Path
 
 import pytest
@@ -10,6 +12,7 @@ from foundpose.features.precision import (
     autocast_precision,
     cpu_instructions,
     has_fast_bfloat16,
+    quantize_linear_layers,
 )
 from tests.features.test_dinov2 import tiny
 
@@ -64,6 +67,61 @@ def test_what_was_asked_for_is_what_runs(monkeypatch) -> None:
     for capability, expected in (((6, 1), None), ((7, 5), "fp16"), ((8, 0), "bf16"), ((9, 0), "bf16")):
         monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device, c=capability: c)
         assert autocast_precision("auto", torch.device("cuda")) == expected
+
+
+def linear_by_hand(x: torch.Tensor, layer: torch.nn.Linear) -> torch.Tensor:
+    """Dynamic quantisation, from its definition: inputs on 7 bits from least to most, weights on 8 around zero."""
+    low, high = min(float(x.min()), 0.0), max(float(x.max()), 0.0)
+    step = (high - low) / 127
+    zero = round(-low / step)
+    inputs = ((x / step).round() + zero).clamp(0, 127) - zero
+    weight_step = max(-float(layer.weight.min()) / 128, float(layer.weight.max()) / 127, 1e-9)
+    weights = (layer.weight / weight_step).round().clamp(-128, 127)
+    return (inputs @ weights.T) * (step * weight_step) + layer.bias
+
+
+def test_linear_layers_multiply_integers(generator) -> None:
+    model = torch.nn.Sequential(torch.nn.Linear(40, 24))
+    x = torch.randn(50, 40, generator=generator)
+    quantized = copy.deepcopy(model)
+    quantize_linear_layers(quantized)
+    with torch.no_grad():
+        found, expected, exact = quantized(x), linear_by_hand(x, model[0]), model(x)
+    rounding = (expected - exact).norm()
+    assert 0.002 < rounding / exact.norm() < 0.03
+    assert (found - expected).norm() < 0.5 * rounding
+
+
+def test_int8_is_for_inference_and_leaves_the_weights(images) -> None:
+    exact, rounded, calls = tiny(), tiny(precision="int8"), []
+    rounded.register_forward_hook(lambda *_: calls.append(None))
+    with torch.no_grad():
+        found, expected = rounded(images), exact(images)
+    assert len(calls) == 1
+    for one, other in zip(found, expected, strict=True):
+        assert not torch.equal(one, other)
+        assert (one - other).norm() < 0.1 * other.norm()
+    assert torch.equal(rounded(images).patches, exact(images).patches)  # where a gradient may be asked for
+    assert rounded.running_precision() == "int8"
+    assert rounded.fingerprint() == exact.fingerprint()
+    assert list(rounded.state_dict()) == list(exact.state_dict())
+    rounded._forward_hooks.clear()
+    copied = pickle.loads(pickle.dumps(rounded))
+    with torch.no_grad():
+        assert torch.equal(copied(images).patches, found.patches)
+        for weight in copied.model.parameters():
+            weight.mul_(0.5)  # as an optimiser does
+        changed = tiny(precision="int8")
+        changed.model.load_state_dict(copied.model.state_dict())
+        assert torch.equal(copied(images).patches, changed(images).patches)
+        assert not torch.equal(copied(images).patches, found.patches)
+
+
+def test_int8_is_refused_where_it_cannot_be(images) -> None:
+    with pytest.raises(ValueError, match="'int8' cannot be compiled; set compile=false"):
+        tiny(precision="int8", compile=True)
+    with pytest.raises(ValueError, match="'int8' is for CPUs, the network is on meta"), torch.no_grad():
+        tiny(precision="int8").to("meta")(images)
 
 
 def test_extractors_around_another_run_in_its_precision() -> None:
