@@ -82,6 +82,7 @@ class PretrainedExtractor(PatchExtractor):
         self.precision = precision
         self.compiled = compile
         self._compiled: Callable[[Tensor, int], PatchFeatures] | None = None
+        self._at_once: int | None = None  # images on a CPU; None: as many as fit its cache
         self._int8: tuple[tuple[object, ...], Self] | None = None  # not a submodule: its weights are these
         self.register_buffer("mean", torch.tensor(mean).view(3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(std).view(3, 1, 1), persistent=False)
@@ -153,13 +154,14 @@ class PretrainedExtractor(PatchExtractor):
         state = (id(self.model), *((w.dtype, 0 if w.is_inference() else w._version) for w in weights))
         if self._int8 is None or self._int8[0] != state:
             quantized = copy.deepcopy(self)
-            quantized.precision = None
+            # Scales are of all that is multiplied at once: a descriptor must not depend on other images.
+            quantized.precision, quantized._at_once = None, 1
             quantize_linear_layers(quantized.model)
             self._int8 = state, quantized
         return self._int8[1]
 
     def _run_in_parts(self, pixels: Tensor, border: int) -> PatchFeatures:
-        count = max(1, CPU_PIXELS // pixels[0, 0].numel())
+        count = self._at_once or max(1, CPU_PIXELS // pixels[0, 0].numel())
         if pixels.device.type != "cpu" or len(pixels) <= count:
             return self._run(pixels, border)
         patches, cls = zip(*(self._run(part, border) for part in pixels.split(count)), strict=True)

@@ -97,7 +97,9 @@ def test_int8_is_for_inference_and_leaves_the_weights(images) -> None:
     rounded.register_forward_hook(lambda *_: calls.append(None))
     with torch.no_grad():
         found, expected = rounded(images), exact(images)
-    assert len(calls) == 1
+        alone = [rounded(image[None]).patches for image in images]
+    assert len(calls) == 1 + len(images)
+    assert torch.equal(found.patches, torch.cat(alone))  # no image changes another's scales
     for one, other in zip(found, expected, strict=True):
         assert not torch.equal(one, other)
         assert (one - other).norm() < 0.1 * other.norm()
